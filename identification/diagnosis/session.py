@@ -56,7 +56,7 @@ from identification.diagnosis.improvement import (
     made_worse,
     spoilt,
 )
-from identification.diagnosis.learned import LearnedClaim, marked, variable_of
+from identification.diagnosis.learned import Equivalence, LearnedClaim, marked, variable_of
 from identification.diagnosis.lines import without_turn
 from identification.diagnosis.locate import Unexplained, spectral_peak
 from identification.diagnosis.outcome import refusals
@@ -501,7 +501,7 @@ class Session:
             self._partial(c, before, after, end, where)
             for c, (before, after) in zip(claims, itertools.pairwise(steps), strict=True)
         ]
-        held = self.bench.held_against(claims, end)
+        held = self._held_against(_Standing(tuple(steps), tuple(claims)))
         curves = [e.curve for e in held.values() if e.curve is not None]
         doubts = self.bench.artefacts(end, [*curves, *(c.curve for c in learned)], steps[0])
         judged = [marked(c, solution, held.get(c.label), doubts) for c in judged]
@@ -959,7 +959,7 @@ class Session:
         """
         if not standing.claims or (decided and self._over(standing.now)):
             return None
-        held = self.bench.held_against(standing.claims, standing.now)
+        held = self._held_against(standing)
         wrong = {c.label: held[c.label] for c in standing.claims if c.label in held}
         needed = {n for c in standing.claims for n in c.effect.needs}
         wrong = {label: e for label, e in wrong.items() if e.is_wrong}
@@ -977,6 +977,20 @@ class Session:
                 self._located[c.balance] = variable_of(c.effect)
         return self._replay([c for c in standing.claims if c.label not in wrong], standing)
 
+    def _held_against(self, standing: _Standing) -> dict[str, Equivalence]:
+        """Names against curves over their own variables, each on the rows that show it."""
+        now, claims = standing.now, standing.claims
+        held = dict(self.bench.held_against(claims, now))
+        for kernel in {c.kernel for c in claims if c.kernel is not None}:
+            slower = (self.bench.slower(factor) for factor in SLOWER)
+            bench = next(b for b in slower if b is not None and b.data.kernel == kernel)
+            slow = bench.fitted(now.solution.model, now.solution.values, again=True)
+            there = bench.held_against(claims, bench.step(None, None, slow))
+            shown = {c.label for c in claims if c.kernel == kernel}
+            held = {k: e for k, e in held.items() if k not in shown}
+            held.update((k, e) for k, e in there.items() if k in shown)
+        return held
+
     def _by_curves(self, standing: _Standing, decided: Sequence[Claim]) -> _Standing | None:
         """The steps without the names of a balance that they cannot explain, where a curve over a
         variable explains it in their place; None where it is not so.
@@ -989,7 +1003,7 @@ class Session:
         own variable, what hardly a joint is without, and what is no law.
         """
         over = {b for b, e in self.bench.ratios(standing.now).items() if e.ratio > RATIO_LIMIT}
-        held = self.bench.held_against(standing.claims, standing.now) if over else {}
+        held = self._held_against(standing) if over else {}
         kept, gone = list[Claim](), list[Claim]()
         for c in standing.claims:
             is_name = len(c.effects) == 1 and c.label in held and held[c.label].is_name

@@ -317,6 +317,18 @@ def test_what_slow_rows_alone_say_against_a_name_says_nothing(tmp_path: Path) ->
     assert errors[1] < 0.3 * errors[0]
 
 
+def test_what_only_longer_rows_show_is_held_against_their_curve(tmp_path: Path) -> None:
+    """In short rows a reading that hums hides the law, and what is a curve there is the hum."""
+    folder = write_case(make_case(220011, kind="single", size=1.0), tmp_path, "encoders")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    found = improve(train, joint, [held])
+    (claim,) = found.claims
+    assert claim.kernel is not None
+    assert "asymmetric_coulomb" in claim.effects
+    assert found.verdict == "complete"
+
+
 def test_where_a_balance_fails_the_curve_is_a_claim(snag: Run) -> None:
     error = assess(snag.solution.model, snag.data, snag.data.held_out, snag.solution.values)
     (claim,) = learned_claims(snag.solution, snag.data, error, RATIO_LIMIT)
