@@ -192,6 +192,9 @@ class Session:
         What the check gate said about the records.
     refused : mapping of str to str
         Labels that are not taken up, with the reason.
+    longer : bool
+        The rows are longer than those that the answer is judged on: no error as a whole is shown
+        of them, and what one balance leaves of its noise there decides on no other.
     """
 
     def __init__(
@@ -200,8 +203,11 @@ class Session:
         progress: Progress | None = None,
         warnings: Sequence[str] = (),
         refused: Mapping[str, str] = MappingProxyType({}),
+        *,
+        longer: bool = False,
     ) -> None:
         self.bench, self.joint = bench, bench.joint
+        self._worse = spoilt if longer else made_worse
         self.progress: Progress = progress or (lambda text, share: None)
         self._warnings = tuple(warnings)
         self._refused = dict(refused)
@@ -366,7 +372,7 @@ class Session:
                 if fall < LEAST_ADDED_DROP
                 else ""
             )
-            worse = little or made_worse(standing.now.held_out, after.held_out)
+            worse = little or self._worse(standing.now.held_out, after.held_out)
             if worse:
                 self._refused[label] = worse
                 continue
@@ -739,7 +745,7 @@ class Session:
             self._longer.setdefault(now.model.structure, {}).update(
                 (b, (bench.data.kernel, ratio)) for b, ratio in left.items()
             )
-            found = Session(bench, refused=self._refused).diagnose(slow)
+            found = Session(bench, refused=self._refused, longer=True).diagnose(slow)
             if (
                 not found.claims
                 or found.claims[0].balance not in over
@@ -843,7 +849,7 @@ class Session:
             told = replace(told, effects=odds.names, label=best.label)
             made = self._replay(standing.with_claim(position, told), standing, best.solution.values)
             there = made.steps[position : position + 2]
-            worse = made_worse(there[0].held_out, there[-1].held_out)
+            worse = self._worse(there[0].held_out, there[-1].held_out)
             if worse:  # as of any addition: it has learned the noise of the training records
                 spoiling.add(best.label)
                 self._refused[best.label] = worse

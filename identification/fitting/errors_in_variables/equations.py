@@ -180,11 +180,15 @@ class _Equations:
 
     def as_near_as(self, start: _Equations) -> bool:
         """Whether the balances that other sensors meet are left no farther above their floors than
-        before, but for the scatter of a mean square.
+        before, and the others by no more than all of their noise, but for the scatter of a mean
+        square: the least squares cannot have hidden more.
         """
         before, after = start.over_floor, self.over_floor
         met = self.instruments.met if self.instruments else frozenset[str]()
-        return all(after[b][0] <= before[b][0] * (1 + SURE_ERRORS * after[b][1]) for b in met)
+        return all(
+            mean <= (before[b][0] + (b not in met)) * (1 + SURE_ERRORS * scatter)
+            for b, (mean, scatter) in after.items()
+        )
 
     @cached_property
     def over_floor(self) -> dict[str, tuple[float, float]]:
