@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, final
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +60,8 @@ as too high.
 """
 LEAST_MARGIN: Final = 0.5
 """Share of a noise level that a residual may fall to by chance, however few its rows."""
+LEAST_DEVIATION: Final = 1e-12
+"""Of a row without noise [N.m]: what rounding leaves of torques of 1 N.m."""
 
 
 @final
@@ -301,12 +303,13 @@ def innovations(
     memory: float,
     records: Sequence[WeakRecord],
 ) -> FloatArray:
-    """Residuals (rows,) of a balance over their deviation, each beside what the rows before it say
-    of the drift: of unit RMS where drift and scatter are all that is left.
+    """Residuals of a balance over their deviation, each beside what the rows before it say of the
+    drift: of unit RMS where drift and scatter are all that is left.
 
     Parameters
     ----------
-    residual : (rows,) array
+    residual : (rows,) or (rows, k) array
+        Or columns of it, as linear in the rows as a residual is.
     scatter, drift : (rows,) array
         Deviation of each row but for the drift (infinite: the row says nothing), and by it.
     memory : float
@@ -314,15 +317,16 @@ def innovations(
     records : sequence of WeakRecord
         Whose rows these are; each has a course of its own.
     """
-    out = np.empty(len(residual))
+    out = np.empty(residual.shape)
     first = 0
     for w in records:
         rows = slice(first, first + w.rows)
         first += w.rows
+        given: Any = residual[rows]
         kept = np.exp(-np.diff(w.time, prepend=w.time[:1]) / memory)
         state, power, course = 0.0, 1.0, []
         for r, f, g, k in zip(
-            residual[rows].tolist(),
+            given.tolist() if residual.ndim == 1 else given,
             (scatter[rows] ** 2).tolist(),
             drift[rows].tolist(),
             kept.tolist(),
@@ -332,11 +336,22 @@ def innovations(
             spread = g * g * power + f
             error = r - g * state
             sure = 0.0 < spread < math.inf
-            course.append(error / math.sqrt(spread) if sure else 0.0)
+            course.append(error / math.sqrt(spread) if sure else 0.0 * error)
             gain = power * g / spread if sure else 0.0
             state, power = state + gain * error, power * (1.0 - gain * g)
         out[rows] = course
     return out
+
+
+def apart_from_drift(
+    scatter: FloatArray, drift: FloatArray, quick: FloatArray | float = 0.0
+) -> FloatArray:
+    """Deviation (rows,) of the rows of a balance but for what a drift gives them (rows,), of the
+    deviation with it (infinite: the row says nothing); no less than the `quick` part of their
+    noise.
+    """
+    least = np.maximum(quick, LEAST_DEVIATION)
+    return np.asarray(np.sqrt(np.maximum(scatter**2 - drift**2, least**2)))
 
 
 def drifts_beside(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, Part]:

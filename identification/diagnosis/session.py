@@ -494,7 +494,12 @@ class Session:
         lines = self.bench.lines(end) if over or last is not None else []
         minor: tuple[Claim, ...] = ()
         if last is not None:
-            small = [t for t in minor_claims(*last) if self.bench.same_sign(t, solution)]
+            told = {n for c in claims for n in c.effects}
+            small = [
+                t
+                for t in minor_claims(*last)
+                if t.key not in told and self.bench.same_sign(t, solution)
+            ]
             minor = tuple(
                 Claim((t.key,), t.candidate.label, t.balance, t.held_out_drop_percent)
                 for t in small
@@ -891,8 +896,16 @@ class Session:
                 self._refused[claim.label] = (
                     f"explains less than {EFFECTS[new.effects[0]].title} alone"
                 )
+                self._stands_for(new, claim)
                 return told
         return None
+
+    def _stands_for(self, new: Claim, old: Claim) -> None:
+        """Names that gave their place are fitted whole beside the name that took it: rows in which
+        this one does better may do so by chance.
+        """
+        near = self._near.get(new.label, {})
+        self._near[new.label] = {**near, **{n: 0.0 for n in old.effects if n not in new.effects}}
 
     def _instead(self, new: Claim, after: Step, standing: _Standing) -> _Standing | None:
         """Another name of an earlier set that alone leaves no more than that set's first name
@@ -1065,6 +1078,7 @@ class Session:
                 self._refused[claim.label] = (
                     "is not needed any more once the later effects are in the model"
                 )
+                self._stands_for(standing.claims[-1], claim)
                 return self._replay(current, standing)
             if (
                 best is not None

@@ -16,6 +16,8 @@ from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
 from identification.balance.kinematic import residual_unit
 from identification.balance.stacked import (
+    LEAST_DEVIATION,
+    apart_from_drift,
     drift_memory,
     innovations,
     noise_believed,
@@ -201,7 +203,7 @@ def assess(
     quick, drift = noise_rows(model, data, values, records)
     floor = together(quick, drift, records)
     wide = row_weights(
-        balances, data, values, {b: np.maximum(floor[b], 1e-12) for b in floor}, records
+        balances, data, values, {b: np.maximum(floor[b], LEAST_DEVIATION) for b in floor}, records
     )
     weights = {b: w[rows[b]] for b, w in wide.items()}
     steps = left_open.steps(data, records, values, wide) if left_open is not None else {}
@@ -212,12 +214,7 @@ def assess(
     powers = _powers(over, wide, rows, turning)
     ratios = {b: math.sqrt(powers[b] + prices[b]) for b in whole}
     if memory := drift_memory(data):
-        scatter = {
-            b: np.sqrt(
-                np.maximum(wide[b] ** -2.0 - drift[b] ** 2, np.maximum(quick[b], 1e-12) ** 2)
-            )
-            for b in whole
-        }
+        scatter = {b: apart_from_drift(1 / wide[b], drift[b], quick[b]) for b in whole}
         courses = {
             b: innovations(
                 np.where(rows[b], beside[b], 0.0),

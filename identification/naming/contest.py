@@ -18,8 +18,12 @@ from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
     TURN_WIDTHS,
+    apart_from_drift,
     drawn_floors,
+    drift_memory,
+    innovations,
     noise_believed,
+    noise_rows,
     rms,
     stack,
     support_of,
@@ -161,11 +165,12 @@ class Contest:
         self.rivals, self.data = tuple(rivals), data
         names = self.data.sensing.balances
         entitled = _entitled(self.rivals, data)
-        left = [
-            {b: r * weight[b] for b, r in _left(rival, data).items()}
-            for rival, weight in zip(self.rivals, entitled, strict=True)
-        ]
         self._taking = {b: taking_part(b, data.train) for b in names}
+        self._drift = [_drift(rival, data) for rival in self.rivals]
+        left = [
+            {b: self._apart(k, b, r, entitled[k][b]) for b, r in _left(rival, data).items()}
+            for k, rival in enumerate(self.rivals)
+        ]
         unlikely = [_unlikely(rival, data) for rival in self.rivals]
         known = [x / INDEPENDENT_SHARE for x in unlikely]
         costs = [_cost(r, self._taking) + x for r, x in zip(left, known, strict=True)]
@@ -179,11 +184,11 @@ class Contest:
         own = entitled[best]
         self._old = [
             self._rows(
-                rival,
+                k,
                 data,
                 {b: w * weight[b] / own[b] for b, w in self.leader.solution.weights.items()},
             )
-            for rival, weight in zip(self.rivals, entitled, strict=True)
+            for k, weight in enumerate(entitled)
         ]
 
     def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
@@ -197,17 +202,31 @@ class Contest:
             for b, taking in self._taking.items()
         ]
 
+    def _apart(self, k: int, balance: str, rows: FloatArray, weight: FloatArray) -> FloatArray:
+        """Rows of a balance, (rows,) or (rows, p), of a rival over their scatter: where a measured
+        torque drifts, each beside what those before it say of that. A slow law takes a part of one
+        course of a drift, and that would count as often as it has rows.
+        """
+        drift = self._drift[k].get(balance)
+        if drift is None:
+            return rows * (weight if rows.ndim == 1 else weight[:, None])
+        scatter = np.divide(1.0, weight, out=np.full(len(weight), np.inf), where=weight > 0)
+        scatter = np.where(self._taking[balance], apart_from_drift(scatter, drift), np.inf)
+        memory, records = drift_memory(self.data), self.data.train
+        return innovations(rows, scatter, drift, memory=memory, records=records)
+
     def _rows(
-        self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]
+        self, k: int, data: Dataset, weights: Mapping[str, FloatArray]
     ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
         """Weighted residual, Jacobian over free parameters and unknowns of the runs, block of each
         row."""
+        rival = self.rivals[k]
         form = form_of(rival.solution, data, self.free(rival), weights)
         x = np.array([form.values[n] for n in form.free])
         stacked = form.stacked(x)
         names = form.balances.balances
-        r = np.concatenate([stacked.residual[b] * weights[b] for b in names])
-        j = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+        r = np.concatenate([self._apart(k, b, stacked.residual[b], weights[b]) for b in names])
+        j = np.concatenate([self._apart(k, b, stacked.jacobian[b], weights[b]) for b in names])
         block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in names])
         return r, j, block
 
@@ -371,6 +390,15 @@ def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatA
             own = [at[b] for at in drawn[k]] if k in sure else calm
             level[b] = np.repeat(own, [w.rows for w in data.train])
     return levels
+
+
+def _drift(rival: Rival, data: Dataset) -> dict[str, FloatArray]:
+    """What the drift of the measured torques gives each row of a balance of a rival, by balance;
+    none where none drifts.
+    """
+    if not drift_memory(data):
+        return {}
+    return noise_rows(rival.solution.model, data, rival.solution.values, data.train)[1]
 
 
 def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:
