@@ -22,6 +22,7 @@ from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from identification.balance.beside import (
     BIWEIGHT,
@@ -69,6 +70,12 @@ FEWEST_PASSES: Final = 4.0
 """Passes over a place in one direction from which a friction over it is no course in time: as many
 as reversals are asked for. A curve of a place that is passed once follows any drift.
 """
+PASSES_EACH: Final = 2.0
+"""Passes in one direction that a piece of the course of a friction has: a drift, which does not
+turn with the motion, goes through four times with changing sign and leaves next to nothing in it.
+"""
+MOST_PIECES: Final = 6
+"""Of such a course over a record: a gear that warms has a quarter of its record to do it in."""
 OCTAVES: Final = 5
 """Octaves from which a course of the power is told: three more than it has unknowns."""
 
@@ -118,14 +125,14 @@ def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
     columns: dict[str, tuple[str, list[FloatArray]]] = {}
     if "drive" in a:
         state = [column for side in sides for column in motion_of(a, side)]
-        state += _curves(record, sides[0], every)
+        state += [*_curves(record, sides[0], every), *_warming(record, sides[0], every)]
         state.append(a["drive_rate"])
         columns["drive"] = "drive", state
         if "torque" in a:
             columns["both"] = "drive", [*state, a["torque"], a["torque_rate"]]
     if "torque" in a:
         state = [*motion_of(a, sides[-1]), *_curves(record, sides[-1], every), a["torque_rate"]]
-        columns["torque"] = "torque", state
+        columns["torque"] = "torque", [*state, *_warming(record, sides[-1], every)]
     return {key: rest_beside(a[signal], state, ROUNDS) for key, (signal, state) in columns.items()}
 
 
@@ -193,6 +200,18 @@ def _curves(
     if _passes(like or [record], position) >= FEWEST_PASSES:
         curves.append(any_curve(record, position, kept, nodes[position], velocity))
     return curves
+
+
+def _warming(record: WeakRecord, side: str, kept: npt.NDArray[np.bool_]) -> list[FloatArray]:
+    """Courses of a friction that changes while a record runs, as where a gear warms: power that
+    falls from octave to octave, but it turns with the motion, and no reading does.
+    """
+    pieces = min(MOST_PIECES, int(_passes([record], f"{side}_position") / PASSES_EACH))
+    if pieces < PASSES_EACH:
+        return []
+    time = record.points["time"]
+    nodes = np.linspace(float(time[0]), float(time[-1]), pieces + 1)
+    return [any_curve(record, "time", kept, nodes, f"{side}_velocity")]
 
 
 def _passes(records: Sequence[WeakRecord], position: str) -> float:
@@ -346,6 +365,9 @@ def _beside_laws(
     columns = [np.equal.outer(number, np.arange(len(records))).astype(np.float64)]
     curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
     columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
+    warming = [_warming(w, side, k) for w, k in zip(records, kept, strict=True)]
+    if all(warming):
+        columns.append(block_diag(*(parts[0] for parts in warming)))
     values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
     return np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
 

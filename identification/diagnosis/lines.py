@@ -185,9 +185,9 @@ def named_orders(joint: Joint) -> tuple[float, ...]:
 
 def without_turn(lines: Sequence[Line], joint: Joint) -> tuple[str, ...]:
     """What would name the lines of a linear axis of whose motor nobody knows the turn."""
-    nameless = [line for line in lines if not line.effects]
-    if joint.turns_per_unit or not nameless:
+    if joint.turns_per_unit or all(line.effects for line in lines):
         return ()
+    nameless = [line for line in lines if not line.effects]
     periods = " and ".join(f"{1e3 / line.order:.3g} mm" for line in nameless)
     return (
         f"something repeats every {periods}, and nothing says how far the axis moves per turn of "

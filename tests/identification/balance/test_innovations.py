@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from identification.balance.stacked import innovations
+from identification.balance.stacked import apart_from_drift, innovations
 from identification.balance.weak import WeakRecord, prepare
 
 FloatArray = npt.NDArray[np.float64]
@@ -66,3 +66,19 @@ def test_a_row_without_any_deviation_is_left_out() -> None:
     )
     assert found[5] == 0.0
     assert found[others] == pytest.approx(alone, abs=1e-12)
+
+
+def test_columns_are_each_taken_alone() -> None:
+    stamps, residual, scatter, drift = rows(15, 4)
+    scatter[3] = np.inf
+    columns = np.column_stack([residual, residual**2, np.ones(15)])
+    found = innovations(columns, scatter, drift, memory=MEMORY, records=[at(stamps)])
+    for column, new in zip(columns.T, found.T, strict=True):
+        alone = innovations(column, scatter, drift, memory=MEMORY, records=[at(stamps)])
+        assert new == pytest.approx(alone, abs=1e-12)
+
+
+def test_what_a_drift_gives_rows_is_taken_off_their_deviation() -> None:
+    """But for the part of their noise that is none of it, however large the drift is said to be."""
+    scatter, drift = np.array([0.5, 0.5, np.inf, 0.0]), np.array([0.3, 0.9, 0.3, 0.0])
+    assert apart_from_drift(scatter, drift, 0.1) == pytest.approx([0.4, 0.1, np.inf, 0.1])

@@ -125,6 +125,15 @@ def test_a_friction_that_changes_with_the_place_is_no_drift(tmp_path: Path) -> N
     )
 
 
+def test_a_friction_that_changes_while_a_record_runs_is_no_drift(tmp_path: Path) -> None:
+    """It turns with the motion: 17 N by which a gear's friction fell were a drift of 8 N."""
+    joint, train, held_out = recorded(230009, "single", tmp_path)
+    data = load_dataset([train], [held_out], joint, prepared_model(joint, train))
+    found = {s: n.drift.size for s, n in data.sources.items() if n.drift is not None}
+    assert found.get("drive", 0.0) < 1.0
+    assert found.get("torque", 0.0) < 1.0
+
+
 def test_a_law_is_the_same_in_every_record_and_a_drift_is_not(tmp_path: Path) -> None:
     """Over the few speeds of its sweeps a curve of its own followed the drift of each record."""
     joint, train, held_out = recorded(200020, "single", tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from casadi_models import JointModel
 from identification import improve
 from identification.balance.dataset import Dataset
 from identification.data.formats import chances
-from identification.data.joint_file import Joint
+from identification.data.joint_file import Joint, load_joint
+from identification.data.read import read
 from identification.diagnosis.claims import Ranking, rank
 from identification.diagnosis.trials import make_base
 from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
@@ -33,6 +35,7 @@ from identification.naming.contest import (
     rivals_of,
 )
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
+from tests.recorded_world.world import make_case, write_case
 from tests.smooth_laws import Law, record
 
 FloatArray = npt.NDArray[np.float64]
@@ -408,3 +411,17 @@ def test_names_that_are_less_probable_than_nothing_are_no_claim(drags: Contest) 
     doubted = odds_of(drags, 1e9)
     assert doubted.nothing == pytest.approx(1 / 3, abs=0.01)
     assert doubted.nothing > sure.nothing
+
+
+def test_a_drift_does_not_decide_between_two_names(tmp_path: Path) -> None:
+    """A torque that is periodic in the position takes a part of one course of a drift, and rows in
+    which it did were as many witnesses against the motor constant that is off.
+    """
+    folder = write_case(make_case(230005, kind="single", size=1.0), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    found = improve(train, joint, [held])
+    (claim,) = found.claims
+    assert {"motor_constant_error", "torque_sensor_gain", "cyclic_torque"} <= set(claim.effects)
+    assert not {n for m in found.minor for n in m.effects} & set(claim.effects)
+    assert found.verdict == "complete"
