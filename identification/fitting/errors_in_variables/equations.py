@@ -25,6 +25,7 @@ from identification.balance.stacked import (
     drawn_floors,
     noise_believed,
     stack,
+    taking_part,
 )
 from identification.fitting.covariance import RANK
 from identification.fitting.errors_in_variables.bands import Bands
@@ -69,8 +70,9 @@ def unbiased(
     """Values at which the normal equations hold without the noise, inside the limits, and what
     noise adds there.
 
-    The correction is one of first order. Where it leaves more than noise can have hidden, a law
-    bent under it: then shapes stay, or all of it is left out. Where other sensors meet the columns
+    The correction is one of first order. Where it leaves more than noise can have hidden, which is
+    what it has of the directions and never more than all of it, a law bent under it: then shapes
+    stay, or all of it is left out. Where other sensors meet the columns
     of a balance, its residual must stay as near to its floor as it was: a motion that tells a value
     neither way sends it anywhere.
 
@@ -105,6 +107,7 @@ def unbiased(
             # where it began: a correction that ran away may end where all is noise
             share = equations.largest_share(moving)
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
+            hidden &= found.rows @ found.rows <= began + MOST_HIDDEN * found.noise_squares
             if hidden and found.as_near_as(start):
                 return Unbiased(dict(found.problem.values), found.noise, found.instruments)
     return Unbiased(dict(problem.values), no_noise(problem))
@@ -180,15 +183,24 @@ class _Equations:
 
     def as_near_as(self, start: _Equations) -> bool:
         """Whether the balances that other sensors meet are left no farther above their floors than
-        before, and the others by no more than all of their noise, but for the scatter of a mean
-        square: the least squares cannot have hidden more.
+        before, but for the scatter of a mean square.
         """
         before, after = start.over_floor, self.over_floor
         met = self.instruments.met if self.instruments else frozenset[str]()
-        return all(
-            mean <= (before[b][0] + (b not in met)) * (1 + SURE_ERRORS * scatter)
-            for b, (mean, scatter) in after.items()
-        )
+        return all(after[b][0] <= before[b][0] * (1 + SURE_ERRORS * after[b][1]) for b in met)
+
+    @property
+    def noise_squares(self) -> float:
+        """Squares of all rows, weighted, that are noise: more the least squares cannot hide."""
+        problem, train = self.problem, self.problem.data.train
+        model, total = problem.balances.model, 0.0
+        levels = [drawn_floors(model, problem.data, problem.values, w) for w in train]
+        for b in problem.balances.balances:
+            level = np.concatenate(
+                [np.full(w.rows, x[b]) for w, x in zip(train, levels, strict=True)]
+            )
+            total += float(np.sum((level * problem.weights[b])[taking_part(b, train)] ** 2))
+        return total
 
     @cached_property
     def over_floor(self) -> dict[str, tuple[float, float]]:
