@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from identification import InputError, explore, load_joint, read
+from identification.balance.calibration import calibration_found
+from identification.balance.dataset import Dataset
 from identification.variants.exploration import Exploration, Variant
 from tests.recorded_world.planted import FILES, NEW, RIGS, plant, write
-from tests.recorded_world.scoring import SAME
+from tests.recorded_world.scoring import SAME, taken_up
 from tests.recorded_world.world import asked, make_case, truth, write_case
 
 SENSORS: Final = "all"
@@ -90,13 +92,21 @@ def hidden_in(variant: Variant, said: Mapping[str, Any]) -> set[str]:
     return {n for n in said["hidden"] if keys & ({n} | SAME.get(n, frozenset()))}
 
 
-def right(variant: Variant, said: Mapping[str, Any]) -> bool:
-    """Whether a variant is the true structure."""
-    true = set(said["neutral"]) | _taken_up(variant, said)
+def right(variant: Variant, said: Mapping[str, Any], data: Dataset) -> bool:
+    """Whether a variant, fitted to some records, is the true structure."""
+    elsewhere = _elsewhere(variant, said, data)
+    true = set(said["neutral"]) | elsewhere
     for n in said["hidden"]:
         true |= {n} | SAME.get(n, frozenset())
-    missing = set(said["hidden"]) - hidden_in(variant, said) - _taken_up(variant, said)
+    missing = set(said["hidden"]) - hidden_in(variant, said) - elsewhere
     return not missing and not variant.dropped and _keys(variant, said) <= true
+
+
+def _elsewhere(variant: Variant, said: Mapping[str, Any], data: Dataset) -> set[str]:
+    """Hidden laws that a variant has under another name."""
+    fit = variant.solution
+    found = calibration_found(fit.model, data.train, fit.values, fit.stderr)
+    return taken_up(said, [c.as_json() for c in found])
 
 
 def _keys(variant: Variant, said: Mapping[str, Any]) -> set[str]:
@@ -110,21 +120,6 @@ def _keys(variant: Variant, said: Mapping[str, Any]) -> set[str]:
         shapes = [values[n] for n in term.names if "order" in n]
         other = order and shapes and not any(abs(x - order) <= ORDER_SLACK * order for x in shapes)
         found.add(f"{key} of another order" if other else key)
-    return found
-
-
-def _taken_up(variant: Variant, said: Mapping[str, Any]) -> set[str]:
-    """Hidden laws that the model has under another name: a delay as the lateness of a channel, and
-    once per turn of a link that hangs in gravity, whose zero is free."""
-    found = set()
-    delay = said["laws"].get("channel_delay", {}).get("current_delay_s")
-    model, values = variant.solution.model, variant.solution.values
-    late = [abs(values[n]) for n in (*model.calibration, *model.named("delay", "drive"))]
-    if delay and any(abs(x - delay) < 0.5 * delay for x in late):
-        found.add("channel_delay")
-    hangs = float(said["values"].get("TG", 0.0)) > 0.0 and "gravity" not in said["laws"]
-    if hangs and said["places"].get("cyclic_torque") == "link":
-        found.add("cyclic_torque")
     return found
 
 
@@ -150,17 +145,19 @@ def one_joint(seed: int, kind: str, size: float) -> Found | None:
 def judged(found: Exploration, said: Mapping[str, Any], name: str, seconds: float) -> Found:
     """Hold an exploration against the truth."""
     best, improved = found.recommended, found.improved
+    is_right = partial(right, said=said, data=found.data)
+    has = hidden_in(best, said) | _elsewhere(best, said, found.data) & set(said["hidden"])
     return Found(
         seed=int(said["seed"]),
         case=name,
         hidden=len(said["hidden"]),
-        fitted=any(right(v, said) for v in found.variants),
-        front=any(right(v, said) for v in found.front),
-        tied=any(right(v, said) for v in found.ties),
-        recommended=right(best, said),
+        fitted=any(map(is_right, found.variants)),
+        front=any(map(is_right, found.front)),
+        tied=any(map(is_right, found.ties)),
+        recommended=is_right(best),
         ties=len(found.ties),
-        recalled=len(hidden_in(best, said) | _taken_up(best, said) & set(said["hidden"])),
-        improve=improved is not None and right(improved, said),
+        recalled=len(has),
+        improve=improved is not None and is_right(improved),
         told=_told(found.agreement),
         added=" ".join(best.added) or "nothing",
         agreement=found.agreement,

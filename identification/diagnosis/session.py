@@ -15,7 +15,9 @@ from types import MappingProxyType
 from typing import Final, final
 
 from casadi_models import EFFECTS
-from identification.balance.clocks import carrier, places_of
+from casadi_models.hold import DRIVE_DELAY, HOLD_NAME
+from identification.balance.calibration import of_run, within_limits
+from identification.balance.clocks import places_of
 from identification.balance.dataset import Dataset, with_effect, without
 from identification.balance.excitation import (
     claim_limit,
@@ -1222,7 +1224,8 @@ def timed_bench(
     are asked again with that name in the model. And where a scale is missing, no filter fits and
     half of one does, beside which nothing is named: where structure is left the first decision is
     made with the clocks of the records alone, too, whose coefficients are free, and the clocks stay
-    with which it leaves less.
+    with which it leaves less. A drive that is later than a clock may be waits for a part of it and
+    is filtered for the rest as any other: the delay that is named for it is asked for its parts.
 
     Parameters
     ----------
@@ -1258,12 +1261,26 @@ def timed_bench(
         return bench
     if added is None or _cleared(bench, added):
         return bench
-    fuller = added.solution
-    if any(carrier(fuller.model, p) != carrier(model, p) for p in places_of(model)):
-        return bench  # a clock that is named is no calibration any more
     was = shifts_of(bench.data)
-    data = ask(beside=(fuller, was))
+    data = ask(beside=(_with_late_drive(bench, added.solution), was))
     return bench if shifts_of(data) == was else JointBench(joint, data, train, held, like=like)
+
+
+def _with_late_drive(bench: Bench, solution: Solution) -> Solution:
+    """A fit whose drive is as late as the rows have it: a clock that stands at its bound is in its
+    place a delay, which has none.
+
+    What is later than a logger can be is to be named, but that it waits for a part of it and is
+    filtered for the rest is known before its name.
+    """
+    model, train = solution.model, bench.data.train
+    moving = within_limits(model, train, solution.values)
+    if HOLD_NAME not in model.calibration or all(of_run(HOLD_NAME, w) in moving for w in train):
+        return solution
+    late = solution.values[HOLD_NAME]
+    named = with_effect(model, DRIVE_DELAY)
+    begin = dict.fromkeys(named.named("delay", "drive"), late)
+    return bench.fitted(named, {**solution.values, **begin}, again=True)
 
 
 def _cleared(bench: Bench, step: Step | None) -> bool:

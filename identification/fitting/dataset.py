@@ -151,11 +151,14 @@ def _late(model: JointModel, record: WeakRecord, values: Mapping[str, float]) ->
 def _lateness(
     model: JointModel, record: WeakRecord, place: str, values: Mapping[str, float]
 ) -> float:
-    """All of the lateness of a channel that the fit finds [s]."""
+    """All of the lateness of a channel that the fit finds [s]: of a clock no more than a clock may
+    have, of a delay that the model names all of it.
+    """
     name, most = carrier(model, place), MOST_SKEW * record.grid.dt
     if name is None:
         return 0.0
-    return float(np.clip(values.get(of_run(name, record), values[name]), -most, most))
+    late = values.get(of_run(name, record), values[name])
+    return float(np.clip(late, -most, most)) if name in model.calibration else float(late)
 
 
 def _read(

@@ -55,6 +55,9 @@ class Judged:
         Share of the resamplings in which the variant is the best.
     windows, records : tuple of int
         The best variant of each part of the records, and of each record alone.
+    most : (variants,) array
+        The 95 % quantile of error less that of the best, over resampled blocks: certainly less up
+        to 0.
     """
 
     best: int
@@ -63,6 +66,7 @@ class Judged:
     behind: FloatArray
     chosen: FloatArray
     windows: tuple[int, ...]
+    most: FloatArray
     records: tuple[int, ...] = ()
 
 
@@ -104,12 +108,15 @@ def judged(
     count = np.zeros((DRAWS, squares.shape[1]))
     for k, drawn in enumerate(draws):
         count[k] = np.bincount(used[drawn], minlength=squares.shape[1])
-    drawn_scores = score_of(
-        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), price
+    drawn_errors = score_of(
+        np.einsum("dk,vkb->dvb", count, squares), np.einsum("dk,vkb->dvb", count, rows), 0 * price
     )
+    drawn_scores = drawn_errors + price
     aside = np.where(open_to, 0.0, np.inf)
     best = int(np.argmin(score + aside))
     behind = np.quantile(drawn_scores - drawn_scores[:, [best]], TIE_QUANTILE, axis=0)
+    apart = drawn_errors - drawn_errors[:, [best]]
+    most = np.quantile(apart, 1 - TIE_QUANTILE, axis=0)
     chosen = np.bincount((drawn_scores + aside).argmin(axis=1), minlength=len(refits)) / DRAWS
     windows = tuple(
         int(np.argmin(aside + _on(part, squares, rows, price)))
@@ -117,7 +124,7 @@ def judged(
         if len(part)
     )
     alone = tuple(int(np.argmin(aside + _on(part, squares, rows, price))) for part in records)
-    return Judged(best, error, score, behind, chosen, windows, records=alone)
+    return Judged(best, error, score, behind, chosen, windows, most, alone)
 
 
 def _on(blocks: IntArray, squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
@@ -133,7 +140,11 @@ def tied_with_best(
 ) -> list[bool]:
     """Which variants the records do not tell from the best one, itself among them.
 
-    One that holds all parts of another tie and more, and is no better, says nothing beside it.
+    One that holds all parts of another tie and more, and is no better, says nothing beside it. But
+    where what it has beyond the best one lowers the error for certain, and by more than the margin,
+    nothing has decided but the price: it guards against laws that imitate what no model holds, and
+    whether it is one of these the records do not tell. Of two such ones that with less error
+    and a score that is better by more than the margin leaves nothing to be said for the other.
 
     Parameters
     ----------
@@ -146,23 +157,38 @@ def tied_with_best(
         For a label of the best one, those that whole fits leave for its place, however many
         parameters they have.
     """
-    behind = scores.score - scores.score[scores.best]
-    apart = np.maximum(behind, np.abs(scores.error - scores.error[scores.best]))
-    alike = [
-        w and bool(q <= 0 or d <= TIE_MARGIN or exchanged(parts[scores.best], own, sets))
-        for w, q, d, own in zip(open_to, scores.behind, apart, parts, strict=True)
+    best = scores.best
+    behind = scores.score - scores.score[best]
+    apart = np.maximum(behind, np.abs(scores.error - scores.error[best]))
+    less = scores.error[best] - scores.error
+    more = [
+        parts[best] < own and bool(most < 0 and fall >= TIE_MARGIN)
+        for own, most, fall in zip(parts, scores.most, less, strict=True)
     ]
-    return [
-        k == scores.best
-        or (
-            alike[k]
-            and not any(
-                alike[j] and parts[j] < parts[k] and behind[j] <= behind[k]
-                for j in range(len(parts))
-            )
+    more = [
+        m
+        and not any(
+            other and less[j] >= less[k] and behind[j] < behind[k] - TIE_MARGIN
+            for j, other in enumerate(more)
         )
-        for k in range(len(parts))
+        for k, m in enumerate(more)
     ]
+    alike = [
+        w and bool(q <= 0 or d <= TIE_MARGIN or m or exchanged(parts[best], own, sets))
+        for w, q, d, m, own in zip(open_to, scores.behind, apart, more, parts, strict=True)
+    ]
+
+    def says_nothing(k: int) -> bool:
+        """Whether a tie has all parts of another one and more without being better."""
+        return any(
+            alike[j]
+            and parts[j] < parts[k]
+            and behind[j] <= behind[k]
+            and not (more[k] and less[k] - less[j] >= TIE_MARGIN)
+            for j in range(len(parts))
+        )
+
+    return [k == best or (alike[k] and not says_nothing(k)) for k in range(len(parts))]
 
 
 def exchanged(

@@ -300,6 +300,14 @@ def _difference(v: Variant) -> str:
     return " and ".join(said) or "as it stands"
 
 
+def _beside(best: Variant, tie: Variant) -> str:
+    """A tie in words: what it changes, or what only its price keeps out of the best one."""
+    more = [label for label in tie.added if label not in best.added]
+    if tie.dropped or not set(best.added) < set(tie.added):
+        return _difference(tie)
+    return f"the same with {_listed(more)} as well, which lowers the error by less than is asked"
+
+
 def _reason(found: Exploration) -> str:
     best = found.recommended
     said = f"Recommended: the joint's model {_difference(best)}"
@@ -360,7 +368,7 @@ def _alike(found: Exploration) -> str:
         beside = f" beside {_listed(sure)}" if sure else ""
         said.append(f"any other choice of {' and '.join(choices)}{beside}")
     most = ALTERNATIVES - len(said)
-    said += [_difference(v) for v in others[:most]]
+    said += [_beside(best, v) for v in others[:most]]
     more = len(others) - most
     return "; ".join(said) + (f"; and {more} more" if more > 0 else "")
 

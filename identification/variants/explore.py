@@ -27,7 +27,7 @@ from identification.diagnosis.learned import with_curves
 from identification.diagnosis.session import Session
 from identification.errors import InputError
 from identification.fitting.engine import Solution, reweighed
-from identification.variants.choice import front_of, judged, tied_with_best
+from identification.variants.choice import TIE_MARGIN, front_of, judged, tied_with_best
 from identification.variants.exploration import (
     Exploration,
     StandIn,
@@ -51,7 +51,7 @@ from identification.variants.refit import (
     physical,
     with_size,
 )
-from identification.variants.screen import LARGEST, Scored, Screen
+from identification.variants.screen import EARNED, LARGEST, Scored, Screen
 
 SHOWN: Final = 40
 """Variants of the screen that are fitted: on simulated joints the best after the fit was among the
@@ -247,13 +247,22 @@ class Search:
             self._fit_scored(screen, scored, (best,))
 
     def _grown(self) -> bool:
-        """Whether parts beside the best variant make a better one."""
+        """Whether parts beside the best variant make a better one.
+
+        Parts that may lower the error by enough to be told as a tie are fitted beside it, whatever
+        their price.
+        """
         now = self._best()
         nodes, _ = self.ground.nodes(now.solution.model)
         screen = self._screen(now.solution, nodes, {}, 0.8)
-        ranked = [s for s in screen.search(FURTHER) if s.options]
-        for scored in itertools.islice((s for s in ranked if screen.real(s.options)), FIRST):
+        ranked = screen.search(FURTHER)
+        grown = (s for s in ranked if s.options and screen.real(s.options))
+        for scored in itertools.islice(grown, FIRST):
             self._fit_scored(screen, scored, ())
+        for scored in screen.lowering(ranked, EARNED * TIE_MARGIN):
+            model = assembled(now.solution.model, screen.parts(scored.options))
+            if model is not None:  # a worse valley would have it fall out
+                self._fit(model, *map(screen.start_of, screen.grid_of(scored)), again=True)
         return self._best() is not now
 
     def _neighbours(self) -> None:
@@ -287,8 +296,8 @@ class Search:
                 odds = self.session.named(solution, label)
                 if odds is None or not odds.alike:
                     continue
-                for rival in odds.alike:
-                    self._fit(rival.solution.model, rival.solution.values)
+                for rival in odds.alike:  # these were looked for in every valley
+                    self._fit(rival.solution.model, rival.solution.values, again=True)
                 # whether anything is missing there at all the score has told
                 left = frozenset(r.label for r in odds.alike)
                 fallen = {n: why for n, why in odds.behind.items() if n not in left}

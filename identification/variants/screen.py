@@ -34,8 +34,8 @@ sixty-first pair has never been best on the simulated joints."""
 LARGEST: Final = 4
 """Effects that a variant adds at most in one expansion."""
 EARNED: Final = 0.5
-"""Share of its price that a part must earn in the screen to be fitted: to first order a good part
-loses up to half of its gain."""
+"""Share of its price, or of what is told, that a part must bring in the screen to be fitted: to
+first order a good part loses up to half of its gain."""
 SWEEPS: Final = 2
 """Rounds over the shapes of a variant; a third one changes nothing on grids of two to twelve
 points."""
@@ -319,6 +319,25 @@ class Screen:
             )
             if earns and self.real(scored.options):
                 yield scored
+
+    def lowering(self, ranked: Sequence[Scored], least: float) -> list[Scored]:
+        """Of scored variants those with one part that lowers the error, its price left out, by so
+        much at least; best first.
+        """
+        price = {s.options: sum(p.price for p in self.parts(s.options)) for s in ranked}
+        base = next(s.score for s in ranked if not s.options)
+        return [
+            s
+            for s in ranked
+            if len(s.options) == 1
+            and base - (s.score - price[s.options]) >= least
+            and self.real(s.options)
+        ]
+
+    def grid_of(self, single: Scored) -> list[tuple[int, ...]]:
+        """A variant with one part, at every point of the grid of its shapes."""
+        (option,) = single.options
+        return [(k,) for k in self._of[self.options[option].node]]
 
     def swapped(self, variant: Sequence[int]) -> list[Scored]:
         """A variant with one of its parts exchanged, or left out; best first."""

@@ -21,6 +21,8 @@ SAME: Final[Mapping[str, frozenset[str]]] = {
 true cause.
 """
 LEARNED: Final = "learned"
+DELAYED: Final = "motor_current"
+"""Channel that a hidden delay makes late."""
 ORDER_SLACK: Final = 0.05
 """Orders nearer than this are one line, where the answer states no wider tolerance."""
 CLEAN: Final = frozenset({"nothing_missing", "complete"})
@@ -104,15 +106,22 @@ def _is_order(line: Json, order: float, truth: Mapping[str, Any]) -> bool:
     return any(abs(told - o) <= slack * o for o in known.get(per, []))
 
 
-def _taken_up(truth: Mapping[str, Any], result: Json) -> set[str]:
-    """Hidden laws that the model has under another name: a delay that the answer reports as a skew
-    of the same channel, and once per turn of a link that hangs in gravity, whose zero is free.
+def taken_up(truth: Mapping[str, Any], calibration: Iterable[Json]) -> set[str]:
+    """Hidden laws that a model has under another name: a delay as a skew of the same channel, and
+    once per turn of a link that hangs in gravity, whose zero is free.
+
+    Parameters
+    ----------
+    truth : mapping
+        The truth file.
+    calibration : iterable of mapping
+        What was found of the sensors, each as in ``improve.schema.json``.
     """
     found = set()
     law = truth["laws"].get("channel_delay")
     if law is not None:
         delay = float(law["current_delay_s"])
-        skews = [c for c in result.get("calibration", []) if c["what"] == "skew"]
+        skews = [c for c in calibration if c["what"] == "skew" and c["sensor"] == DELAYED]
         # the drive of a joint is filtered besides: what it waits is the delay
         late = [abs(float(c["value"])) for c in skews]
         late += [float(c["waits"]) for c in skews if c.get("waits") is not None]
@@ -142,8 +151,8 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
         and not any(_is_order(x, orders[n], truth) for x in lines)
     }
     claims = [(_names(c) - missed, c) for c in result["claims"]]
-    taken_up = _taken_up(truth, result)
-    found = set(taken_up)
+    as_other = taken_up(truth, result.get("calibration", []))
+    found = set(as_other)
     found |= {n for n, order in orders.items() if any(_is_order(x, order, truth) for x in lines)}
     found |= {n for n in hidden if any(names & accepted[n] for names, _ in claims)}
     outside = truth["kind"] == "outside"
@@ -174,7 +183,7 @@ def score(truth: Mapping[str, Any], result: Json) -> Answer:
         good = verdict == "unexplained" or learned or bool(found)
     else:
         # what the model took up leaves nothing to be claimed
-        claimed = set(hidden) - taken_up
+        claimed = set(hidden) - as_other
         good = verdict in ({"complete"} if claimed else CLEAN) | left and set(hidden) <= found
     last = result["steps"][-1]["held_out"]
     sensors = truth["sensors"]

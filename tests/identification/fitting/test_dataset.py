@@ -121,6 +121,26 @@ def test_clocks_are_asked_again_beside_what_is_missing(
     )
 
 
+@pytest.mark.parametrize(
+    ("seed", "kind", "waits"), [(435003, "single", 3.65), (431007, "pair", 1.02)]
+)
+def test_a_drive_later_than_a_clock_waits_for_a_part_and_is_filtered_for_the_rest(
+    seed: int, kind: str, waits: float, tmp_path: Path
+) -> None:
+    """They are late by 6.4 and 3.8 samples in all. Shifted by all of that, the motor stood at 8.7
+    and 3.8 times its noise with the delay in the model, and on the first a periodic torque and a
+    gain imitated what was left.
+    """
+    joint, train, test = recorded(seed, kind, tmp_path)
+    session = Session.opened([train], joint, [test])
+    for w in (*session.data.train, *session.data.held_out):
+        assert late(w, "drive") == pytest.approx(waits, abs=0.5)
+    if kind == "single":
+        found = session.run(session.start())
+        assert [c.effects for c in found.claims] == [("channel_delay",)]
+        assert found.verdict == "complete"
+
+
 def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """What no fit takes is refused by the verb that fits, and shown as it was read elsewhere."""
 
