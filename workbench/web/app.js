@@ -258,6 +258,7 @@ function render(moved) {
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
     const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
+    const caret = focused && typeof document.activeElement.selectionStart === "number" ? [document.activeElement.selectionStart, document.activeElement.selectionEnd] : null;
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
     main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
     document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
@@ -265,7 +266,7 @@ function render(moved) {
     (app.after || []).forEach((f) => f());
     app.after = [];
     if (moved) main.focus({ preventScroll: true });
-    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); }
+    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); if (same && caret && same === document.activeElement && typeof same.selectionStart === "number") same.setSelectionRange(...caret); }
     scrollTo(0, where);
   }).catch(fail);
 }
