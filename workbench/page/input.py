@@ -19,7 +19,7 @@ from workbench.page.charts.choices import held_text, known_entry, windows_of
 from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import SOON, Live
 from workbench.page.records import guessed_role, surveyed
-from workbench.page.session import FileEntry, State
+from workbench.page.session import FileEntry, State, stored_as
 
 LARGEST_JOINT: Final = 1 << 20
 NUMBERS: Final = {key.name: key for key in JOINT.keys if key.kind == "number"}
@@ -371,7 +371,7 @@ def start_demo(live: Live) -> dict[str, Any]:
     if live.state.files:
         raise InputError("the session has records already; start a new one for the demo")
     for name, content in demo_files().items():
-        stored = f"{secrets.token_hex(4)}-{name}"
+        stored = stored_as(name)
         (live.session.files / stored).write_bytes(content)
         add_upload(live, name, stored, len(content))
     return {"ok": True}

@@ -11,7 +11,6 @@ import importlib
 import json
 import logging
 import os
-import secrets
 import shutil
 import socket
 import sys
@@ -57,7 +56,7 @@ from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
-from workbench.page.session import Session, Store, safe_name
+from workbench.page.session import Session, Store, safe_name, stored_as
 from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
 from workbench.page.views import VIEWS, first_plot
 
@@ -309,7 +308,7 @@ async def _upload(request: Request, live: Live, limit: int, store: Store) -> Res
     announced = int(request.headers.get("content-length", "0") or 0)
     refuse_size(name, announced, limit, live.session.files)
     await run_in_threadpool(home.refuse_over, store, name, announced)
-    stored = f"{secrets.token_hex(4)}-{name}"
+    stored = stored_as(name)
     path = live.session.files / stored
     size = await stream_to(path, request.stream(), limit)
 
@@ -512,7 +511,7 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     live = Live(session)
     for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
         name = safe_name(file.name)
-        stored = f"{secrets.token_hex(4)}-{name}"
+        stored = stored_as(name)
         shutil.copyfile(file, session.files / stored)
         with live.library():
             add_upload(live, name, stored, file.stat().st_size)

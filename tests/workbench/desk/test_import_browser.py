@@ -73,3 +73,18 @@ def test_headers_that_say_everything_are_doubted_on_the_card_of_the_record(
     assert expected in said
     if case == "joints side by side":
         assert page.input_value("select[aria-label='Joint']") == "1"
+
+
+@pytest.mark.parametrize("name", ["Prüfstand (2) – Lauf №1, 50 % #a&b.csv", "关节 1号 it's.csv"])
+def test_a_name_stands_on_the_page_as_it_is(page: Any, name: str, tmp_path: Path) -> None:
+    """On its card and in the list of records; and it can be taken out by it."""
+    columns, _ = NAMED["a supply"]
+    path = written(tmp_path, **columns).rename(tmp_path / name)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.set_input_files("#files", [path])
+    page.wait_for_function("() => app.state.files.length === 1 && !busy()")
+    assert page.locator("main h2", has_text=name).count() == 1
+    assert page.inner_text("#series-file option") == name
+    page.get_by_role("button", name=f"Remove {name}", exact=True).click()
+    page.wait_for_function("() => app.state.files.length === 0 && !busy()")

@@ -5,6 +5,7 @@ numbers of the library.
 from __future__ import annotations
 
 import gzip
+import html
 import http.client
 import io
 import json
@@ -16,10 +17,12 @@ import subprocess
 import sys
 import threading
 import time
+import unicodedata
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -34,7 +37,7 @@ from workbench.page.desk import home, sources
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
-from workbench.page.session import Session, State, Store, safe_name, write_atomic
+from workbench.page.session import Session, State, Store, safe_name, stored_as, write_atomic
 from workbench.page.uploads import check_unpacked
 
 LIMIT = 8_000_000
@@ -263,11 +266,83 @@ def test_session_identifiers_cannot_be_guessed_or_listed(client: Client, root: P
         (".hidden", "hidden"),
         ("", "record"),
         ("a\x00b.csv", "a_b.csv"),
-        ("ü.csv", "_.csv"),
+        ("Prüfstand (2) – Lauf №1, 50 %.csv", "Prüfstand (2) – Lauf №1, 50 %.csv"),
+        ("测试/关节 1号.csv", "关节 1号.csv"),
+        ("u\u0308ber.csv", "über.csv"),
+        ("نمونه\u200cها.csv", "نمونه\u200cها.csv"),
+        ("axis\u202evsc.exe", "axis_vsc.exe"),
+        ("a\u200bb.csv", "a_b.csv"),
+        ("\udce9.csv", "_.csv"),
+        ("what?.csv", "what_.csv"),
+        ("C:run.csv", "C_run.csv"),
+        ("aux.csv", "_aux.csv"),
+        ("Com1", "_Com1"),
+        ("console.csv", "console.csv"),
+        ("\u3000 ... ", "record"),
+        ("x.csv. ", "x.csv"),
     ],
 )
 def test_names_of_uploads_are_made_safe(given: str, safe: str) -> None:
     assert safe_name(given) == safe
+
+
+@pytest.mark.parametrize("letter", ["a", "ü", "测", "🦾"])
+@pytest.mark.parametrize("ending", [".csv", ".csv.gz", ".no-ending-is-as-long-as-this"])
+def test_names_too_long_for_a_file_system_are_cut_between_letters(
+    letter: str, ending: str, tmp_path: Path
+) -> None:
+    """While it comes a name has more before and behind it, and the file system takes it then."""
+    made = safe_name(100 * letter + 200 * "b" + ending)
+    assert made.startswith(10 * letter)
+    assert made.endswith(ending) == (len(ending) < 20)
+    assert set(made) <= {letter, *"b", *ending}
+    (tmp_path / f".{stored_as(made)}.01234567.part").touch()
+
+
+def test_a_name_that_the_file_system_cannot_write_is_stored_under_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "fsencode", lambda name: name.encode("latin-1"))
+    assert stored_as("über.csv").endswith("-über.csv")
+    assert stored_as("关节.csv").endswith("-__.csv")
+
+
+def test_names_in_any_script_stay_through_page_report_and_exports(
+    client: Client, root: Path, tmp_path: Path
+) -> None:
+    """Also where the same letters come spelled in another way."""
+    where = client.session()
+    files = {n: c for n, c in demo_files().items() if n.endswith(".npz")}
+    train, held = (next(c for n, c in files.items() if w in n) for w in ("train", "held"))
+    joint = demo_files()["joint.toml"].decode().replace('name = "', 'name = "Gelenk Ä ', 1)
+    names = ("Prüfstand 关节.npz", "held über #1 50%.npz")
+    assert client.upload(where, quote("Gelenk ä.toml"), joint.encode())[0] == 200
+    assert client.upload(where, quote(unicodedata.normalize("NFD", names[0])), train)[0] == 200
+    assert client.upload(where, quote(names[1]), held)[0] == 200
+    client.run(where, "fit")
+    assert [f["name"] for f in client.get(where)["files"]] == list(names)
+    stored = sorted(p.name.partition("-")[2] for p in (root / where[-32:] / "files").iterdir())
+    assert stored == sorted(names)
+    client.run(where, "report")
+    headers, report = client.raw("GET", f"{where}/view/report.html")[1:]
+    assert all(html.escape(n) in report.decode() for n in names)
+    assert quote("Gelenk_Ä") in headers["content-disposition"]
+    fitted = client.raw("GET", f"{where}/view/joint.toml")[2].decode()
+    assert Path(names[0]).stem in fitted
+
+    for name, content in zip(names, (train, held), strict=True):
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "session.py").write_bytes(client.raw("GET", f"{where}/view/session.py")[2])
+    done = subprocess.run(
+        [sys.executable, "session.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )
+    assert done.returncode == 0, done.stderr
+    assert Path(names[0]).stem in (tmp_path / "fitted.toml").read_text(encoding="utf-8")
 
 
 # --- uploads --------------------------------------------------------------------------------------
