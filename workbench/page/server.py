@@ -18,7 +18,7 @@ import threading
 import webbrowser
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, final
@@ -90,12 +90,13 @@ PAGE: Final = {
 @final
 @dataclass
 class Service:
-    """The sessions of one server."""
+    """The sessions of one server, and what their Replay page may follow."""
 
     store: Store
     max_upload: int
-    lives: OrderedDict[str, Live]
-    lock: threading.Lock
+    sources: tuple[str, ...] = ()
+    lives: OrderedDict[str, Live] = field(default_factory=OrderedDict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def live(self, identifier: str) -> Live:
         """A session by its identifier.
@@ -126,7 +127,7 @@ class Service:
         """A session of this server's own: a second one would write over what the first has done."""
         _held(session)
         try:
-            return Live(session)
+            return Live(session, self.sources)
         except BaseException:
             release(session.folder)
             raise
@@ -399,6 +400,7 @@ def create_app(
     port: int = 8765,
     max_upload: int = MAX_UPLOAD,
     hosts: frozenset[str] | None = None,
+    follow: Sequence[str | Path] = (),
 ) -> Guard:
     """The application.
 
@@ -412,8 +414,15 @@ def create_app(
         Largest upload in bytes.
     hosts : set of str, optional
         Host headers in place of the loopback names.
+    follow : sequence of path
+        Files that are being written, and addresses of streams, which the Replay page may follow.
+
+    Raises
+    ------
+    InputError
+        One of them cannot be followed.
     """
-    service = Service(Store(root), max_upload, OrderedDict(), threading.Lock())
+    service = Service(Store(root), max_upload, sources.named(follow))
     home.sweep_empty(service.store)
 
     async def page(request: Request) -> Response:
@@ -552,7 +561,7 @@ def serve(
     with _listen(port) as listening:
         port = int(listening.getsockname()[1])
         key = home.key_of(Store(folder))
-        sources.allow(folder, follow)
+        app = create_app(folder, port=port, follow=follow)
         tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
         address = f"http://127.0.0.1:{port}/{tail}"
         if say is not None:
@@ -561,7 +570,7 @@ def serve(
             sys.stdout.write(address + "\n")
             sys.stdout.flush()
         config = uvicorn.Config(
-            create_app(folder, port=port),
+            app,
             log_level="warning",
             access_log=False,
             server_header=False,

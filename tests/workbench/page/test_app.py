@@ -33,7 +33,7 @@ pytest.importorskip("uvicorn")
 from identification.errors import InputError
 from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
-from workbench.page.desk import home, sources
+from workbench.page.desk import home
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
@@ -973,14 +973,44 @@ def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) 
         server.kill()
 
 
-def test_nothing_is_written_where_nothing_may_be_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The server starts on a disk that takes no more."""
-    sources.allow(tmp_path, [tmp_path / "live.csv"])
-    monkeypatch.setattr(sources, "write_atomic", None)
-    sources.allow(tmp_path, [])
-    assert sources.allowed(tmp_path) == []
+def test_each_of_two_servers_offers_what_it_was_started_with(tmp_path: Path) -> None:
+    """They serve the same sessions; neither takes or gets what the other one may follow."""
+    mine, theirs, root = tmp_path / "mine.csv", tmp_path / "theirs.csv", tmp_path / "sessions"
+    stream = "udp://127.0.0.1:9870"
+    with (
+        serving(root, follow=[mine, stream]) as first,
+        serving(root, follow=[theirs]) as second,
+        serving(root) as third,
+    ):
+        clients = [Client(s.port) for s in (first, second, third)]
+        given = [[str(mine), stream], [str(theirs)], []]
+        sessions = [client.session() for client in clients]
+        for client, where, own in zip(clients, sessions, given, strict=True):
+            assert client.get(f"{where}/view/replay")["sources"] == own
+            for other in {str(mine), str(theirs), stream, "/etc/passwd"} - set(own):
+                status, said = client.post(f"{where}/run", {"action": "follow", "source": other})
+                assert (status, "was not named when the page was started" in said) == (422, True)
+        status, said = clients[1].post(
+            f"{sessions[1]}/run", {"action": "follow", "source": str(theirs)}
+        )
+        assert status == 202, said
+        assert clients[1].wait(sessions[1])["error"].startswith("follow: fit first")
+    assert not list(root.glob("*.json")), "what a server may follow is not kept in the folder"
+
+
+def test_what_was_followed_goes_on_only_where_the_next_server_may(tmp_path: Path) -> None:
+    """A server that was killed while it followed: its session is opened by one without the file."""
+    from workbench.page import verbs
+    from workbench.page.live import Live
+
+    path = str(tmp_path / "live.csv")
+    session = Store(tmp_path / "sessions").create()
+    session.begin({"action": "follow", "source": path})
+    live = Live(session)
+    verbs.resume(live)
+    assert live.job is None
+    assert "was not named when the page was started" in str(live.snapshot()["error"])
+    live.close()
 
 
 def test_a_quota_that_is_no_number_is_one_sentence(
