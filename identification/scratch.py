@@ -42,8 +42,15 @@ _LEFT: Final = re.compile(
 
 
 def outer_folder() -> Path:
-    """Folder for temporary files that outlive the run."""
-    return Path(_OUTER[0] if _OUTER else tempfile.gettempdir())
+    """Folder for temporary files that outlive the run; where none can be written, the one in which
+    they would be.
+    """
+    if _OUTER:
+        return Path(_OUTER[0])
+    try:
+        return Path(tempfile.gettempdir())
+    except OSError:  # every disk is full: whoever writes there says so
+        return Path(os.environ.get("TMPDIR") or ("/tmp" if os.name == "posix" else os.curdir))  # noqa: S108
 
 
 @contextlib.contextmanager
@@ -65,11 +72,30 @@ def folder_beside(place: Path, prefix: str) -> Iterator[str]:
 
 
 @contextlib.contextmanager
+def deaf_children() -> Iterator[None]:
+    """Processes that are started here hear no Ctrl-C, which a terminal sends to them as well: one
+    that still loads its modules would print a trace. The parent ends them.
+    """
+    mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+    if mask is None:
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its start takes the mask off again
+    before = mask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        mask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
 def own_folder() -> Iterator[None]:
     """Keep all temporary files of the run, and of its children, in one folder that is removed at
     its end; remove those of runs that were killed.
     """
-    outer = Path(tempfile.gettempdir())
+    outer = outer_folder()
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     try:
         _swept_runs(outer)
@@ -243,4 +269,4 @@ def _opener_of_old(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW)
 
 
-__all__ = ["hold", "outer_folder", "own_folder", "release", "sweep"]
+__all__ = ["deaf_children", "hold", "outer_folder", "own_folder", "release", "sweep"]
