@@ -13,6 +13,7 @@ import contextlib
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import signal
 import tempfile
@@ -35,6 +36,8 @@ _HELD: Final[dict[str, IO[bytes]]] = {}
 """Locks of this process, by what they stand for."""
 _OUTER: Final[list[str]] = []
 """The folder for temporary files outside that of the run."""
+_KEPT: Final = 100
+"""Bytes of a name that stand in the name of its half-written file."""
 _LEFT: Final = re.compile(
     r"\.(?:.*\.[0-9a-f]{8}\.part|.*-[a-z0-9_]{8}\.part|build-[a-z0-9_]{8}|write-[a-z0-9_]{8})"
 )
@@ -144,6 +147,18 @@ def _rid(left: Path) -> None:
         left.unlink(missing_ok=True)
 
 
+def part_of(target: Path) -> Path:
+    """Where a file is written before it replaces its target: beside it, under a name that is no
+    longer than a file system takes, and that :func:`sweep` knows.
+    """
+    return target.with_name(f"{_start(target)}{secrets.token_hex(4)}.part")
+
+
+def _start(target: Path) -> str:
+    kept = os.fsencode(target.name)[:_KEPT]
+    return f".{kept.decode(errors='ignore')}."
+
+
 def hold(target: Path) -> None:
     """Hold a result, a file or a folder, until `release` or the end of the process, and remove
     what a killed run left half written beside (in) it.
@@ -164,7 +179,7 @@ def hold(target: Path) -> None:
     if folder.is_dir():
         sweep(folder)
     else:
-        sweep(folder.parent, f".{folder.name[:100]}.")
+        sweep(folder.parent, _start(folder))
 
 
 def release(target: Path | None = None) -> None:
@@ -269,4 +284,4 @@ def _opener_of_old(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW)
 
 
-__all__ = ["deaf_children", "hold", "outer_folder", "own_folder", "release", "sweep"]
+__all__ = ["deaf_children", "hold", "outer_folder", "own_folder", "part_of", "release", "sweep"]

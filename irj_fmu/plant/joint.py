@@ -35,6 +35,10 @@ REFERENCE: Final = ("reference_position", "reference_velocity", "reference_accel
 BANDWIDTH: Final = 30.0
 """Bandwidth of the position controller's default gains [rad/s]; its damping ratio is 0.8."""
 _DAMPING: Final = 0.8
+LONGEST_NAME: Final = 100
+"""Characters of an FMU's name that come from the joint's: with what kind, endings and temporary
+files put around it a file name stays within the 255 bytes of file systems.
+"""
 _MOTOR: Final = ("motor_position", "motor_velocity")
 _LINK_POSITION, _LINK_VELOCITY = (CHANNELS.index(n) for n in ("link_position", "link_velocity"))
 
@@ -81,8 +85,8 @@ class PlantOptions:
 
 
 def identifier(name: str) -> str:
-    """Return a C identifier made of a name."""
-    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "joint"
+    """Return a C identifier made of a name, at most `LONGEST_NAME` characters of it."""
+    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[:LONGEST_NAME] or "joint"
     return f"joint_{made}" if made[0].isdigit() else made
 
 

@@ -387,6 +387,14 @@ def test_fitted_joint_with_added_effects(tmp_path: Path) -> None:
     ).all()
 
 
+def test_a_joint_with_a_long_name_has_an_fmu(tmp_path: Path) -> None:
+    """The name is a file's, too; a long one was refused as a full disk."""
+    joint = replace(reference_joint("hd1"), name="Achse, " * 60)
+    path = built(tmp_path, joint)
+    assert path.name.startswith("Achse_Achse")
+    assert path.stat().st_size > 0
+
+
 def test_linear_axis_has_linear_units(tmp_path: Path) -> None:
     path = built(
         tmp_path, Joint(name="slide", kind="linear", model_name="hd1", effects=("viscous",))

@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Final, final
 
 from identification.errors import InputError
-from identification.scratch import hold, sweep
+from identification.scratch import hold, part_of, sweep
 
 VERSION: Final = 1
 _ID: Final = re.compile(r"^[0-9a-f]{32}$")
@@ -36,9 +36,7 @@ _JOINERS: Final = frozenset("\u200c\u200d")
 _RESERVED: Final = re.compile(r"(CON|PRN|AUX|NUL|(COM|LPT)[1-9¹²³])\s*(\..*)?", re.IGNORECASE)
 """Devices of one of the systems, with any ending."""
 LONGEST_FILE: Final = 200
-"""Bytes of a name in UTF-8: file systems take 255, of which what is put before and behind it while
-it comes takes 24.
-"""
+"""Bytes of a name in UTF-8: file systems take 255, and something is put before it."""
 _ENDING: Final = 20
 """Bytes of the endings of a name that a cut keeps, which say how it is read."""
 
@@ -47,7 +45,7 @@ def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader, or a crash, sees the old content or the new one, never a
     part.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    temporary = part_of(path)
     try:
         with temporary.open("wb") as stream:
             stream.write(content)

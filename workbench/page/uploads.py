@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import zipfile
 import zlib
 from collections.abc import AsyncIterator
@@ -11,6 +10,7 @@ from shutil import disk_usage
 from typing import Any, Final
 
 from identification.errors import InputError
+from identification.scratch import part_of
 
 MAX_UPLOAD: Final = 1 << 30
 """Largest upload in bytes."""
@@ -55,7 +55,7 @@ async def stream_to(path: Path, chunks: AsyncIterator[bytes], limit: int) -> int
     TooLargeError
         More than `limit` bytes came.
     """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    part = part_of(path)
     size = 0
     try:
         with part.open("wb") as stream:

@@ -31,6 +31,7 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
+from identification.scratch import part_of
 from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
 from workbench.page.desk import home
@@ -291,12 +292,13 @@ def test_names_of_uploads_are_made_safe(given: str, safe: str) -> None:
 def test_names_too_long_for_a_file_system_are_cut_between_letters(
     letter: str, ending: str, tmp_path: Path
 ) -> None:
-    """While it comes a name has more before and behind it, and the file system takes it then."""
+    """The file system takes it with what is put before it, also while it comes."""
     made = safe_name(100 * letter + 200 * "b" + ending)
     assert made.startswith(10 * letter)
     assert made.endswith(ending) == (len(ending) < 20)
     assert set(made) <= {letter, *"b", *ending}
-    (tmp_path / f".{stored_as(made)}.01234567.part").touch()
+    (tmp_path / stored_as(made)).touch()
+    part_of(tmp_path / stored_as(made)).touch()
 
 
 def test_a_name_that_the_file_system_cannot_write_is_stored_under_another_one(
