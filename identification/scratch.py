@@ -32,8 +32,8 @@ trace where they are gone.
 """
 TRIES: Final = 10
 """Times a lock is tried whose file goes just then."""
-_HELD: Final[dict[str, IO[bytes]]] = {}
-"""Locks of this process, by what they stand for."""
+_HELD: Final[dict[str, contextlib.ExitStack]] = {}
+"""What gives the locks of this process free, by what they stand for."""
 _OUTER: Final[list[str]] = []
 """The folder for temporary files outside that of the run."""
 _KEPT: Final = 100
@@ -171,10 +171,16 @@ def hold(target: Path) -> None:
     place = os.path.realpath(target)
     if place in _HELD:
         return
-    lock = _lock_of(place)
-    if lock is None:
-        return
-    _HELD[place] = lock
+    with contextlib.ExitStack() as locks:
+        try:
+            found = _lock_beside(place, locks), _lock_on(place, locks)
+        except BlockingIOError:
+            raise InputError(
+                f"{place}: another irj is writing it; wait for it or write somewhere else"
+            ) from None
+        if not any(found):
+            return
+        _HELD[place] = locks.pop_all()
     folder = Path(place)
     if folder.is_dir():
         sweep(folder)
@@ -185,8 +191,8 @@ def hold(target: Path) -> None:
 def release(target: Path | None = None) -> None:
     """Give a result free, or all of them."""
     for place in list(_HELD) if target is None else [os.path.realpath(target)]:
-        if (lock := _HELD.pop(place, None)) is not None:
-            _given_back(lock)
+        if (locks := _HELD.pop(place, None)) is not None:
+            locks.close()
 
 
 def sweep(folder: Path, start: str = "") -> None:
@@ -213,22 +219,56 @@ def _swept_runs(outer: Path) -> None:
                 lock.close()
 
 
-def _lock_of(place: str) -> IO[bytes] | None:
-    """The lock of a result; None where there are no locks, or no folder for them."""
+def _lock_beside(place: str, locks: contextlib.ExitStack) -> bool:
+    """Take the lock of a result, which lies among the temporary files; False where there are no
+    locks, or no folder for them.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process has it.
+    """
     user, folder = _user(), _lock_folder(outer_folder())
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         about = folder.lstat()
         if about.st_uid != user or folder.is_symlink() or about.st_mode & 0o022:
-            return None  # somebody else's folder
-        lock = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:32]
-        return _taken(lock)
+            return False  # somebody else's folder
+        lock = _taken(folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:32])
     except BlockingIOError:
-        raise InputError(
-            f"{place}: another irj is writing it; wait for it or write somewhere else"
-        ) from None
+        raise
     except OSError:
-        return None
+        return False
+    if lock is None:
+        return False
+    locks.callback(_given_back, lock)
+    return True
+
+
+def _lock_on(place: str, locks: contextlib.ExitStack) -> bool:
+    """Take a folder itself, as far as it is there and its file system has such locks: processes
+    with other folders for temporary files meet here.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process has it.
+    """
+    try:
+        import fcntl
+
+        handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except (ImportError, OSError):
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        if isinstance(error, BlockingIOError):
+            raise
+        return False
+    locks.callback(os.close, handle)
+    return True
 
 
 def _user() -> int:
