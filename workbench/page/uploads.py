@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from identification.errors import InputError
 from identification.scratch import part_of
+from workbench.page.session import naming
 
 MAX_UPLOAD: Final = 1 << 30
 """Largest upload in bytes."""
@@ -58,7 +59,7 @@ async def stream_to(path: Path, chunks: AsyncIterator[bytes], limit: int) -> int
     part = part_of(path)
     size = 0
     try:
-        with part.open("wb") as stream:
+        with naming(path), part.open("wb") as stream:
             async for chunk in chunks:
                 size += len(chunk)
                 if size > limit:

@@ -966,7 +966,10 @@ def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) 
         with server.full_disk():
             status, said = client.post("/api/session")
             assert status == 507
-            assert said.startswith("File too large; check the path")
+            assert "state.json: File too large; check the path" in said
+            status, _, said = client.raw("PUT", f"{where}/files/a.csv", b"time_s,motor_current_A")
+            assert status == 507
+            assert b"a.csv: File too large; check the path" in said
             assert {p.name for p in tmp_path.iterdir()} == before
             key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
             assert client.raw("GET", "/api/home", headers=key)[0] == 200
