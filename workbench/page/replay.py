@@ -176,13 +176,18 @@ def follow(
     (folder / FILE).unlink(missing_ok=True)
     with followed_source(path, joint) as source:
         progress(f"waiting for {short}", 0.0)  # from here on nothing of a stream is lost
-        for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
-            now = float(made.record.time[-1])
-            progress(f"following {short}, {now:.0f} s", 0.0)
-            fresh = now > shown and time.monotonic() - written > REWRITTEN
-            if len(made.time) and fresh:
-                written, shown = time.monotonic(), now
-                _kept(folder, made, steps, {"no_detector": why, "live": True})
+        try:
+            for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
+                now = float(made.record.time[-1])
+                progress(f"following {short}, {now:.0f} s", 0.0)
+                fresh = now > shown and time.monotonic() - written > REWRITTEN
+                if len(made.time) and fresh:
+                    written, shown = time.monotonic(), now
+                    _kept(folder, made, steps, {"no_detector": why, "live": True})
+        except InputError:  # what came before a line that cannot be used stays
+            if made is not None:
+                _kept(folder, made, steps, {"no_detector": why})
+            raise
     if made is None:
         raise InputError(f"follow: nothing came into {short}; start the recording first")
     return _kept(folder, made, steps, {"no_detector": why})
