@@ -56,7 +56,7 @@ from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
-from workbench.page.session import Session, Store, safe_name, stored_as
+from workbench.page.session import Session, Store, naming, safe_name, stored_as
 from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
 from workbench.page.views import VIEWS, first_plot
 
@@ -506,7 +506,7 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     Raises
     ------
     InputError
-        A file that does not exist.
+        A file that does not exist, or that cannot be read; no session is left then.
     """
     store = Store(root)
     for file in files:
@@ -518,12 +518,18 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
             )
     session = store.create()
     live = Live(session)
-    for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
-        name = safe_name(file.name)
-        stored = stored_as(name)
-        shutil.copyfile(file, session.files / stored)
-        with live.library():
-            add_upload(live, name, stored, file.stat().st_size)
+    try:
+        for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
+            name = safe_name(file.name)
+            stored = stored_as(name)
+            with naming(session.files / stored):
+                shutil.copyfile(file, session.files / stored)
+            with live.library():
+                add_upload(live, name, stored, file.stat().st_size)
+    except BaseException:  # a session that nobody is told of would keep the files for ever
+        live.close()
+        shutil.rmtree(session.folder, ignore_errors=True)
+        raise
     return session.id
 
 

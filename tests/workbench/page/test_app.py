@@ -819,6 +819,11 @@ def test_files_of_the_command_line_are_in_the_session(tmp_path: Path) -> None:
     assert state.joint_text == JOINT
     with pytest.raises(InputError, match="there is no such file"):
         with_files(tmp_path / "sessions", ["missing.csv"])
+    (tmp_path / "empty.csv").touch()
+    with pytest.raises(InputError, match=r"empty.csv: is empty \(0 bytes\)"):
+        with_files(tmp_path / "sessions", [tmp_path / "train.npz", tmp_path / "empty.csv"])
+    left = [p.name for p in (tmp_path / "sessions").iterdir()]
+    assert left == [identifier], "what could not be opened leaves no session"
 
 
 # --- parts ----------------------------------------------------------------------------------------
