@@ -98,13 +98,16 @@ async function saveJoint(draft, body) {
 function knownAsk(item, rows) {
   const asked = item.asks.map((name) => rows.find((r) => r.name === name)).filter(Boolean), prefix = `ask-${item.effect}`;
   if (!asked.length) return null;
-  const host = h("div", {}, knownRow(asked[0], prefix, ["value", "unit", "side"]));
+  const drafts = app.drafts.asked || (app.drafts.asked = {}), typed = drafts[item.effect] || (drafts[item.effect] = {});
+  const host = h("div", {}, knownRow(asked.find((r) => r.name === typed[`${prefix}-which`]) || asked[0], prefix, ["value", "unit", "side"]));
   const which = asked.length < 2 ? null : h("select", { id: `${prefix}-which`, "aria-label": `Which is known, for ${item.title}`, onchange: (e) => host.replaceChildren(knownRow(asked.find((r) => r.name === e.target.value), prefix, ["value", "unit", "side"])) }, asked.map((r) => h("option", { value: r.name }, words(r.name))));
   const give = () => {
-    const typed = knownAll(host), [[name, entry]] = Object.entries(typed);
+    const given = knownAll(host), [[name, entry]] = Object.entries(given);
     const { problem } = typedNumber(entry.value, words(name), null, null);
     if (problem) { fail(new Error(problem)); $(`${prefix}-${name}-value`).focus(); return; }
-    act(async () => { await post("/joint", { hold: typed, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
+    act(async () => { await post("/joint", { hold: given, source: app.state.joint_source || "joint" }); delete drafts[item.effect]; await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
   };
-  return h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
+  const node = h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
+  keepTyped(node, typed);
+  return node;
 }

@@ -207,3 +207,42 @@ def test_what_is_typed_while_it_is_saved_is_no_part_of_it_and_stays(tabs: Tabs) 
     assert mine.input_value("#gear_ratio") == "-77"
     assert mine.locator("#joint-moved").count() == 0
     mine.reload()
+
+
+def test_a_note_and_a_value_that_are_typed_stay_where_another_tab_works(tabs: Tabs) -> None:
+    """On the tree of fits, and where the diagnosis asks for what is known."""
+    mine, other = tabs.mine, tabs.other
+    mine.evaluate("() => { run('fit', {}, () => run('diagnose', {}, 'ledger')); }")
+    mine.wait_for_function("() => app.state.diagnosis && !busy()", timeout=120_000)
+    step = mine.evaluate("app.state.steps[0].id")
+    mine.evaluate("open('ledger')")
+    mine.click(f"#fit-{step}-note")
+    mine.fill(f"#fit-{step}-text", "half of a note")
+    redrawn(mine, other)
+    assert mine.input_value(f"#fit-{step}-text") == "half of a note"
+    mine.fill(f"#fit-{step}-name", "first")
+    mine.press(f"#fit-{step}-name", "Enter")
+    mine.wait_for_selector(f"#fit-{step}-name", state="detached")
+    assert mine.evaluate("app.state.remarks") == {step: {"name": "first", "note": "half of a note"}}
+
+    mine.evaluate("open('diagnose')")
+    field = "#ask-extra_inertia-motor_inertia-value"
+    mine.wait_for_selector(field, state="attached")
+    unfolded = "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
+    mine.evaluate(unfolded)
+    mine.fill(field, "4.5")
+    redrawn(mine, other)
+    mine.evaluate(unfolded)
+    assert mine.input_value(field) == "4.5"
+
+
+def redrawn(mine: Any, other: Any) -> None:
+    """The other tab gives the session another name: a view of this one is drawn anew."""
+    before = mine.evaluate("app.state.revision")
+    other.evaluate("n => post('/tree', { session: `session ${n}` })", before)
+    mine.wait_for_function(
+        "r => app.state.revision > r && !busy() && !app.asking && "
+        "document.querySelector('#main').dataset.revision === String(app.state.revision)",
+        arg=before,
+    )
+    mine.wait_for_function("() => !document.querySelector('.tree:empty')")
