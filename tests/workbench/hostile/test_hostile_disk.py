@@ -105,6 +105,31 @@ def test_a_compiler_without_room_is_no_broken_compiler(place: Path) -> None:
     assert not (place / "dist").exists()
 
 
+def test_a_batch_without_room_leaves_no_half_of_a_result(place: Path) -> None:
+    """Room enough for the FMU, none for the result of a run; with room it goes on."""
+    study = '[study]\nstop = 10\n[[model]]\njoint = "fitted.toml"\n'
+    (place / "study.toml").write_text(study)
+    done = run(place, "batch study.toml --out res", 300_000)
+    assert done.returncode == 2
+    assert "res/chunks: cannot keep results there (File too large)" in done.stderr
+    assert list(place.rglob("*.part")) == []
+    assert run(place, "batch study.toml --out res", 1 << 30).returncode == 0
+
+
+def test_a_full_disk_for_temporary_files_is_not_that_of_the_results(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where they are two, both are named: the system does not say which one it was."""
+    other = Path("/dev/shm")
+    if not other.is_dir() or other.stat().st_dev == place.stat().st_dev:
+        pytest.skip("one file system here")
+    monkeypatch.setenv("TMPDIR", str(other))
+    done = run(place, "export estimator --joint fitted.toml --out dist", 3_000)
+    assert done.returncode == 2
+    assert done.stderr.startswith("irj: dist, or /dev/shm for temporary files: cannot write there")
+    assert not (place / "dist").exists()
+
+
 def test_what_a_compiler_only_speeds_up_does_without_its_cache(place: Path) -> None:
     code = (
         "from identification.recursive.compiler import NoCompilerError, build\n"
