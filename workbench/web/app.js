@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -318,8 +318,9 @@ function remembered(key, value) {
 }
 
 async function enter(id) {
-  const was = { id: app.id, state: app.state, drafts: app.drafts };
-  app.id = id; app.state = null; app.drafts = {};
+  const was = { id: app.id, state: app.state, drafts: app.drafts, draftsOf: app.draftsOf };
+  app.id = id; app.state = null;
+  if (app.draftsOf !== id) Object.assign(app, { drafts: {}, draftsOf: id }); /* one that comes back is edited on */
   try { [app.state, app.config] = await Promise.all([get(""), call("GET", "/api/config")]); } catch (error) { /* the session that was open stays */
     Object.assign(app, was);
     throw error.gone ? new Error("the server here has no such session; see Sessions for those that it keeps") : error;

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.workbench.chromium import context_of, launched, needs_chromium
+from tests.workbench.page.test_app_clumsy import another_program
 from tests.workbench.served import serving
 
 AXE = os.environ.get("IRJ_AXE", "")
@@ -207,6 +208,35 @@ def test_what_is_typed_while_it_is_saved_is_no_part_of_it_and_stays(tabs: Tabs) 
     assert mine.input_value("#gear_ratio") == "-77"
     assert mine.locator("#joint-moved").count() == 0
     mine.reload()
+
+
+def test_a_draft_stays_while_another_program_answers_for_the_server(
+    opened: Tabs, tmp_path: Path
+) -> None:
+    """The session comes back where its server does, and with it what was being edited."""
+    page = opened.mine.context.browser.new_context().new_page()
+    with serving(tmp_path) as there:
+        port = there.port
+        page.goto(there.address)
+        page.click("#demo")
+        page.wait_for_selector("#fit", timeout=60_000)
+        page.click("#nav-model")
+        drawn(page)
+        page.fill("#name", "half a name")
+    with another_program(port):
+        page.wait_for_selector("#gone-again", timeout=30_000)
+    with serving(tmp_path, port):
+        page.click("#gone-again")
+        page.wait_for_function("() => app.state && !busy()")
+        page.click("#nav-model")
+        drawn(page)
+        assert page.input_value("#name") == "half a name"
+        page.click("#fresh")
+        page.wait_for_selector("#demo")
+        page.click("#nav-model")
+        drawn(page)
+        assert page.input_value("#name") == "joint", "another session begins without it"
+    page.context.close()
 
 
 def test_a_note_and_a_value_that_are_typed_stay_where_another_tab_works(tabs: Tabs) -> None:
