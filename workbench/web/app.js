@@ -273,7 +273,7 @@ function render(moved) {
 
 /* Draw the preview; resolves when it is on the screen. */
 async function showPreview(file, data) {
-  if (!app.upload || app.view !== "load" || app.state.files.length) return;
+  if (!app.upload || app.view !== "load" || !app.state || app.state.files.length) return;
   app.preview = { file: file.name, data };
   render(false);
   const frame = () => new Promise((go) => requestAnimationFrame(go));
@@ -284,7 +284,9 @@ async function upload(files) {
   clearError();
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
   await app.acted; /* a session that is being opened is the one they are for */
+  const id = app.id;
   for (const file of list) {
+    if (app.id !== id) break; /* another one was opened meanwhile: these are not for it */
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
     app.upload = { text: `sending ${file.name}`, share: 0 };
     surround();
@@ -303,7 +305,7 @@ async function upload(files) {
   app.preview = null;
   surround(); /* the bar goes at once, also where the server does not answer any more */
   await refresh().catch(fail);
-  if (had && !app.state.files.length) render(false);
+  if (had && app.id === id && app.state && !app.state.files.length) render(false);
 }
 
 function theme(name) {

@@ -83,8 +83,33 @@ def test_a_name_stands_on_the_page_as_it_is(page: Any, name: str, tmp_path: Path
     page.click("#fresh")
     page.wait_for_selector("#demo")
     page.set_input_files("#files", [path])
-    page.wait_for_function("() => app.state.files.length === 1 && !busy()")
+    page.wait_for_function("() => app.state && app.state.files.length === 1 && !busy()")
     assert page.locator("main h2", has_text=name).count() == 1
     assert page.inner_text("#series-file option") == name
     page.get_by_role("button", name=f"Remove {name}", exact=True).click()
-    page.wait_for_function("() => app.state.files.length === 0 && !busy()")
+    page.wait_for_function("() => app.state && app.state.files.length === 0 && !busy()")
+
+
+def test_files_are_not_for_a_session_that_is_opened_while_they_are_sent(
+    page: Any, tmp_path: Path
+) -> None:
+    """The second of two files went into the new session, or left the page busy for ever."""
+    columns, _ = NAMED["a supply"]
+    first = written(tmp_path, **columns).rename(tmp_path / "first.csv")
+    second = tmp_path / "second.csv"
+    second.write_bytes(first.read_bytes())
+    page.click("#fresh")
+    page.wait_for_function("() => app.state && !busy()")
+    old, held = page.evaluate("app.id"), []
+    page.route("**/files/first.csv*", lambda route: held.append(route))
+    page.set_input_files("#files", [first, second])
+    while not held:
+        page.wait_for_timeout(20)
+    page.click("#fresh")
+    page.wait_for_function("id => app.id !== id && app.state", arg=old)
+    held[0].continue_()
+    page.wait_for_function("() => !busy()")
+    page.unroute("**/files/first.csv*")
+    assert page.evaluate("get('').then((s) => s.files.length)") == 0
+    there = page.evaluate("id => call('GET', `/api/session/${id}`)", old)
+    assert [f["name"] for f in there["files"]] == ["first.csv"]
