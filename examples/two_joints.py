@@ -21,6 +21,7 @@ from fmpy.ssp.simulation import simulate_ssp
 from fmpy.ssp.ssd import read_ssv
 from scipy.integrate import solve_ivp
 
+from casadi_models.text.compensation import RestingLoad, resting_load
 from identification.data.joint_file import Joint, load_joint
 from irj_fmu.estimator.native import NativeSpec, build_native
 from irj_fmu.fmi.ssp import PARAMETERS, System, write_ssp
@@ -58,8 +59,10 @@ class Law:
     ----------
     ratio, per_current : float
         Of the joint.
-    stiffness, damping, inertia, weight : float
-        Gains and feed-forward, link-referred [N.m/rad, N.m.s/rad, kg.m2, N.m].
+    stiffness, damping, inertia : float
+        Gains and feed-forward, link-referred [N.m/rad, N.m.s/rad, kg.m2].
+    load : RestingLoad
+        What it holds at rest.
     """
 
     ratio: float
@@ -67,7 +70,7 @@ class Law:
     stiffness: float
     damping: float
     inertia: float
-    weight: float
+    load: RestingLoad
 
     @staticmethod
     def of(joint: Joint) -> Law:
@@ -80,7 +83,7 @@ class Law:
             inertia * BANDWIDTH**2,
             1.6 * inertia * BANDWIDTH,
             inertia,
-            value["gravity_torque"],
+            resting_load(joint.model()),
         )
 
     def current(self, time: Any, position: Any, velocity: Any) -> Any:
@@ -88,7 +91,7 @@ class Law:
         q, v, a = Motion().expressions(time)
         torque = self.stiffness * (q - position / self.ratio)
         torque += self.damping * (v - velocity / self.ratio) + self.inertia * a
-        return (torque - self.weight * ca.sin(q)) / self.per_current
+        return (torque + self.load.drive(q)) / self.per_current
 
 
 def controller(laws: dict[str, Law]) -> PlantSpec:

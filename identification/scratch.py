@@ -13,6 +13,7 @@ import contextlib
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import signal
 import tempfile
@@ -31,10 +32,12 @@ trace where they are gone.
 """
 TRIES: Final = 10
 """Times a lock is tried whose file goes just then."""
-_HELD: Final[dict[str, IO[bytes]]] = {}
-"""Locks of this process, by what they stand for."""
+_HELD: Final[dict[str, contextlib.ExitStack]] = {}
+"""What gives the locks of this process free, by what they stand for."""
 _OUTER: Final[list[str]] = []
 """The folder for temporary files outside that of the run."""
+_KEPT: Final = 100
+"""Bytes of a name that stand in the name of its half-written file."""
 _LEFT: Final = re.compile(
     r"\.(?:.*\.[0-9a-f]{8}\.part|.*-[a-z0-9_]{8}\.part|build-[a-z0-9_]{8}|write-[a-z0-9_]{8})"
 )
@@ -42,8 +45,15 @@ _LEFT: Final = re.compile(
 
 
 def outer_folder() -> Path:
-    """Folder for temporary files that outlive the run."""
-    return Path(_OUTER[0] if _OUTER else tempfile.gettempdir())
+    """Folder for temporary files that outlive the run; where none can be written, the one in which
+    they would be.
+    """
+    if _OUTER:
+        return Path(_OUTER[0])
+    try:
+        return Path(tempfile.gettempdir())
+    except OSError:  # every disk is full: whoever writes there says so
+        return Path(os.environ.get("TMPDIR") or ("/tmp" if os.name == "posix" else os.curdir))  # noqa: S108
 
 
 @contextlib.contextmanager
@@ -65,11 +75,30 @@ def folder_beside(place: Path, prefix: str) -> Iterator[str]:
 
 
 @contextlib.contextmanager
+def deaf_children() -> Iterator[None]:
+    """Processes that are started here hear no Ctrl-C, which a terminal sends to them as well: one
+    that still loads its modules would print a trace. The parent ends them.
+    """
+    mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+    if mask is None:
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # its start takes the mask off again
+    before = mask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        mask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
 def own_folder() -> Iterator[None]:
     """Keep all temporary files of the run, and of its children, in one folder that is removed at
     its end; remove those of runs that were killed.
     """
-    outer = Path(tempfile.gettempdir())
+    outer = outer_folder()
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     try:
         _swept_runs(outer)
@@ -118,6 +147,18 @@ def _rid(left: Path) -> None:
         left.unlink(missing_ok=True)
 
 
+def part_of(target: Path) -> Path:
+    """Where a file is written before it replaces its target: beside it, under a name that is no
+    longer than a file system takes, and that :func:`sweep` knows.
+    """
+    return target.with_name(f"{_start(target)}{secrets.token_hex(4)}.part")
+
+
+def _start(target: Path) -> str:
+    kept = os.fsencode(target.name)[:_KEPT]
+    return f".{kept.decode(errors='ignore')}."
+
+
 def hold(target: Path) -> None:
     """Hold a result, a file or a folder, until `release` or the end of the process, and remove
     what a killed run left half written beside (in) it.
@@ -130,22 +171,28 @@ def hold(target: Path) -> None:
     place = os.path.realpath(target)
     if place in _HELD:
         return
-    lock = _lock_of(place)
-    if lock is None:
-        return
-    _HELD[place] = lock
+    with contextlib.ExitStack() as locks:
+        try:
+            found = _lock_beside(place, locks), _lock_on(place, locks)
+        except BlockingIOError:
+            raise InputError(
+                f"{place}: another irj is writing it; wait for it or write somewhere else"
+            ) from None
+        if not any(found):
+            return
+        _HELD[place] = locks.pop_all()
     folder = Path(place)
     if folder.is_dir():
         sweep(folder)
     else:
-        sweep(folder.parent, f".{folder.name[:100]}.")
+        sweep(folder.parent, _start(folder))
 
 
 def release(target: Path | None = None) -> None:
     """Give a result free, or all of them."""
     for place in list(_HELD) if target is None else [os.path.realpath(target)]:
-        if (lock := _HELD.pop(place, None)) is not None:
-            _given_back(lock)
+        if (locks := _HELD.pop(place, None)) is not None:
+            locks.close()
 
 
 def sweep(folder: Path, start: str = "") -> None:
@@ -172,22 +219,56 @@ def _swept_runs(outer: Path) -> None:
                 lock.close()
 
 
-def _lock_of(place: str) -> IO[bytes] | None:
-    """The lock of a result; None where there are no locks, or no folder for them."""
+def _lock_beside(place: str, locks: contextlib.ExitStack) -> bool:
+    """Take the lock of a result, which lies among the temporary files; False where there are no
+    locks, or no folder for them.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process has it.
+    """
     user, folder = _user(), _lock_folder(outer_folder())
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         about = folder.lstat()
         if about.st_uid != user or folder.is_symlink() or about.st_mode & 0o022:
-            return None  # somebody else's folder
-        lock = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:32]
-        return _taken(lock)
+            return False  # somebody else's folder
+        lock = _taken(folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:32])
     except BlockingIOError:
-        raise InputError(
-            f"{place}: another irj is writing it; wait for it or write somewhere else"
-        ) from None
+        raise
     except OSError:
-        return None
+        return False
+    if lock is None:
+        return False
+    locks.callback(_given_back, lock)
+    return True
+
+
+def _lock_on(place: str, locks: contextlib.ExitStack) -> bool:
+    """Take a folder itself, as far as it is there and its file system has such locks: processes
+    with other folders for temporary files meet here.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process has it.
+    """
+    try:
+        import fcntl
+
+        handle = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except (ImportError, OSError):
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(handle)
+        if isinstance(error, BlockingIOError):
+            raise
+        return False
+    locks.callback(os.close, handle)
+    return True
 
 
 def _user() -> int:
@@ -243,4 +324,4 @@ def _opener_of_old(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW)
 
 
-__all__ = ["hold", "outer_folder", "own_folder", "release", "sweep"]
+__all__ = ["deaf_children", "hold", "outer_folder", "own_folder", "part_of", "release", "sweep"]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, final
 from identification.data.joint_file import Joint, load_joint
 from identification.data.own_effects import files_of
 from identification.errors import InputError
-from identification.scratch import folder_beside, hold
+from identification.scratch import folder_beside, hold, outer_folder
 from irj_fmu.command_line import (
     OneLineParser,
     check_folder,
@@ -177,10 +177,7 @@ def build(
                     if request.cross_check:
                         done += _cross_check(request, final_path, say)
     except OSError as error:
-        raise InputError(
-            f"{request.out}: cannot write there ({error.strerror or error}); choose a writable "
-            "folder with space on its disk"
-        ) from None
+        raise InputError(_no_room(request.out, error)) from None
     finally:
         for folder in made_folders:
             if not any(folder.iterdir()):
@@ -200,6 +197,18 @@ def _makers(kind: str) -> list[_Maker]:
         "all": [_estimator, _plant, _controlled, _ssp, _native],
     }
     return table[kind]
+
+
+def _no_room(out: Path, error: OSError) -> str:
+    """What is said where a file cannot be written: the system does not say on which disk."""
+    why, temporary = error.strerror or error, outer_folder()
+    place = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
+    if temporary.exists() and temporary.stat().st_dev != place.stat().st_dev:
+        return (
+            f"{out}, or {temporary} for temporary files: cannot write there ({why}); make room, or "
+            "name other folders with --out and TMPDIR"
+        )
+    return f"{out}: cannot write there ({why}); choose a writable folder with space on its disk"
 
 
 def _names(kind: str, base: str) -> list[str]:

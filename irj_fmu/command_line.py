@@ -10,7 +10,6 @@ import json
 import math
 import os
 import re
-import secrets
 import shlex
 import signal
 import sys
@@ -24,7 +23,7 @@ from typing import IO, Any, Final, NoReturn, final
 from identification.crash import internal_error
 from identification.data.schema import meant
 from identification.errors import InputError
-from identification.scratch import hold, release
+from identification.scratch import hold, part_of, release
 
 CRASHED: Final = 3
 """Exit code after an error of the program itself: no answer, neither yes nor no."""
@@ -314,7 +313,7 @@ def replace_file(path: str | Path, write: Callable[[IO[bytes]], object]) -> None
                 write(stream)
             return
         target = Path(os.path.realpath(path))
-        temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
+        temporary = part_of(target)
         try:
             with temporary.open("wb") as stream:
                 write(stream)
@@ -346,7 +345,7 @@ def replace_files(folder: Path, content: Mapping[str, bytes]) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         hold(folder)
         for name, text in content.items():
-            parts[folder / name] = part = folder / f".{name}.{secrets.token_hex(4)}.part"
+            parts[folder / name] = part = part_of(folder / name)
             part.write_bytes(text)
         for target, part in parts.items():
             part.replace(target)

@@ -1,10 +1,12 @@
-"""The friction of a joint alone, as a function of the motion: what a controller adds to
-compensate it.
+"""What a controller adds to compensate a joint: its friction as a function of the motion, and the
+load that it carries at rest.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, final
 
 import casadi as ca
 
@@ -21,6 +23,72 @@ presliding distance.
 INPUTS: Final = ("position", "velocity", "load", "temperature")
 """Inputs before the parameters: [rad, rad/s, N.m, K], link-referred."""
 _SIDES: Final = ("motor", "link")
+
+
+@final
+@dataclass(frozen=True)
+class RestingLoad:
+    """What the drive holds at rest, link-referred [N.m], N on a linear axis.
+
+    The drive that holds the joint at a position q is
+    ``constant - sine * sin(q) - cosine * cos(q)``.
+
+    Attributes
+    ----------
+    sine, cosine : float
+        Parts of the link's weight, with the signs of the parameters of gravity: the sine part is
+        positive upright at zero.
+    constant : float
+        Sum of the laws that depend on nothing: the weight of a linear axis, an offset of the drive.
+    """
+
+    sine: float
+    cosine: float
+    constant: float
+
+    def drive(self, position: Any) -> Any:
+        """The drive that holds it, from a number or an expression of the position."""
+        return self.constant - self.sine * ca.sin(position) - self.cosine * ca.cos(position)
+
+
+def resting_load(model: JointModel) -> RestingLoad:
+    """The load of a model at rest, with the model's values.
+
+    What changes with the position by a law other than gravity (a spring, a torque per turn) is no
+    part of it, nor is friction, which holds by itself.
+    """
+    values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+    upright = model.named("weight")
+    return RestingLoad(
+        sine=sum(values[n] for n in upright),
+        cosine=sum(values[n] for n in model.weights if n not in upright),
+        constant=_constant_load(model),
+    )
+
+
+def _constant_load(model: JointModel) -> float:
+    """What the laws on motor and link that depend on nothing resist with, less what such laws of
+    the drive add.
+    """
+    symbols = model.symbols
+    s, zero = symbols.signals, ca.SX(0)
+    # at rest everything else is zero; what still hangs on one of these is no constant
+    staying = ("motor_position", "link_position", "torque", "drive")
+    moving = [getattr(s, n) for n in Signals.names() if n not in staying]
+    where = ca.vertcat(*(getattr(s, n) for n in staying))
+    p = ca.vertcat(*(symbols.parameters[n] for n in model.parameter_names))
+    total = 0.0
+    for x in placed_laws(model, symbols, zero, zero):
+        held = x.term.place in (*_SIDES, "drive") and x.term.effect.family != "friction"
+        if not held or x.states:
+            continue
+        (law,) = ca.substitute([x.law], moving, [zero] * len(moving))
+        if ca.depends_on(law, where):
+            continue
+        found = float(ca.Function("law", [p], [law])(model.value_vector()))
+        # a typed law may have no value at rest
+        total += (-found if x.term.place == "drive" else found) if math.isfinite(found) else 0.0
+    return total
 
 
 def friction_compensation(model: JointModel) -> Any:
@@ -80,4 +148,4 @@ def _total(laws: list[PlacedLaw], way: Expression) -> Expression:
     return total
 
 
-__all__ = ["INPUTS", "SETTLED", "friction_compensation"]
+__all__ = ["INPUTS", "SETTLED", "RestingLoad", "friction_compensation", "resting_load"]

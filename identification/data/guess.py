@@ -189,7 +189,13 @@ def numbered(names: Sequence[str]) -> dict[int, tuple[str, ...]]:
     if not real:
         return {}
     most = max(real, key=len)
-    return {k: tuple(n for n in names if n in {f.get(k) for f in real}) for k in sorted(most)}
+    columns: dict[int, set[str]] = {k: set() for k in sorted(most)}
+    for family in real:
+        for k, name in family.items():
+            if k in columns:
+                columns[k].add(name)
+    place = {name: i for i, name in enumerate(names)}
+    return {k: tuple(sorted(own, key=place.__getitem__)) for k, own in columns.items()}
 
 
 def of_joint(names: Sequence[str], number: int | None) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ to change in time.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Final, final
 
@@ -85,6 +85,7 @@ class Follower:
         import casadi as ca
 
         from casadi_models.simulate import sampled_step
+        from casadi_models.text.compensation import RestingLoad, resting_load
 
         if not model.is_elastic:
             raise InputError(
@@ -94,13 +95,13 @@ class Follower:
         step = sampled_step(model, dt, substeps)
         size, count = step.size1_in(0), step.size1_in(2)
         x, reference = ca.MX.sym("x", size), ca.MX.sym("r", 3)
-        p, gains = ca.MX.sym("p", count), ca.MX.sym("g", 5)
+        p, gains = ca.MX.sym("p", count), ca.MX.sym("g", 6)
         drive = (
             gains[2] * reference[2]
             + gains[0] * (reference[0] - x[0])
             + gains[1] * (reference[1] - x[1])
         )
-        drive = drive - gains[3] * ca.sin(reference[0]) - gains[4] * ca.cos(reference[0])
+        drive += RestingLoad(gains[3], gains[4], gains[5]).drive(reference[0])
         applied = ca.vertcat(drive, 0, 0)
         outputs = [x, drive, model.dynamics(x, applied, p), model.functions.outputs(x, applied, p)]
         self._sample = ca.Function(
@@ -113,9 +114,7 @@ class Follower:
         start = dict(zip(model.parameter_names, model.value_vector(), strict=True))
         inertia = sum(start[n] for n in model.inertias)
         tuned = controller or Controller()
-        upright = sum(start[n] for n in model.named("weight"))
-        level = sum(start[n] for n in set(model.weights) - set(model.named("weight")))
-        self._gains = np.array([*tuned.gains(inertia), inertia, upright, level])
+        self._gains = np.array([*tuned.gains(inertia), inertia, *astuple(resting_load(model))])
 
     @cached_property
     def _interpreted(self) -> WindowRun:

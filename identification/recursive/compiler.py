@@ -98,7 +98,7 @@ def build(source: str, name: str) -> ctypes.CDLL:
     Raises
     ------
     NoCompilerError
-        No compiler was found, or it failed.
+        No compiler was found, it failed, or the disk has no room for what it makes.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -109,13 +109,16 @@ def build(source: str, name: str) -> ctypes.CDLL:
     )
     digest = hashlib.sha256(identity.encode()).hexdigest()[:32]
     file_name = f"{name}-{digest}{_suffix()}"
-    target = _usable_folder() / file_name
-    if target.is_file():
-        try:
-            return ctypes.CDLL(str(target))
-        except OSError:
-            pass  # a damaged file: build it again
-    _compile(source, compiler, flags, target)
+    try:
+        target = _usable_folder() / file_name
+        if target.is_file():
+            with contextlib.suppress(OSError):  # a damaged file: build it again
+                return ctypes.CDLL(str(target))
+        _compile(source, compiler, flags, target)
+    except OSError as error:  # a full disk: what needs no compiler does without one
+        raise NoCompilerError(
+            f"the compiled library cannot be written ({error.strerror or error})"
+        ) from error
     try:
         return ctypes.CDLL(str(target))
     except OSError as error:

@@ -32,6 +32,7 @@ from identification import __version__
 from identification.data.plain_text import from_toml
 from identification.data.schema import refuse_unknown
 from identification.errors import InputError
+from identification.scratch import deaf_children
 from irj_fmu.batch.checks import names, table
 from irj_fmu.batch.fit_worker import Answer, Parcel, answered
 from irj_fmu.batch.study_schema import FIT_JOINT, FIT_STUDY
@@ -356,7 +357,8 @@ class _Crew:
                 while waiting and len(under_way) < width:
                     number = waiting.pop(0)
                     parcel = parcel_of(self.study, self.study.jobs[number])
-                    under_way[pool.submit(answered, parcel)] = number
+                    with deaf_children():
+                        under_way[pool.submit(answered, parcel)] = number
                 for future in wait(under_way, return_when=FIRST_COMPLETED).done:
                     error = future.exception()
                     if isinstance(error, BrokenExecutor) and self.executor is None:

@@ -21,6 +21,7 @@ from typing import Final, final
 import numpy as np
 
 from identification.errors import InputError
+from identification.scratch import deaf_children
 from irj_fmu.batch.case import Batch
 from irj_fmu.batch.store import Store
 from irj_fmu.batch.worker import FIGURES, Chunk, Done, empty, enter, run_chunk
@@ -380,7 +381,8 @@ class _Run:
             while waiting or under_way:
                 while waiting and len(under_way) < width:
                     chunk = waiting.pop(0)
-                    under_way[pool.submit(run_chunk, chunk)] = chunk
+                    with deaf_children():
+                        under_way[pool.submit(run_chunk, chunk)] = chunk
                 finished, _ = wait(under_way, return_when=FIRST_COMPLETED)
                 for future in finished:
                     error = future.exception()

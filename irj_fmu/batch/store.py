@@ -138,6 +138,8 @@ class Store:
                 f"{self.folder}: cannot keep results there ({error.strerror or error}); make "
                 "room and run again to go on"
             ) from None
+        finally:
+            part.unlink(missing_ok=True)
 
     def _path(self, chunk: Chunk) -> Path:
         return Path(self.folder or "") / f"chunk-{chunk.number:06d}.npz"

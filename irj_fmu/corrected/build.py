@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from irj_fmu.fmi.compiler import (
     compile_library,
     find_compiler,
     header_folder,
+    model_code,
     native_target,
 )
 from irj_fmu.fmi.targets import FMI3_FOLDERS, binaries, native_targets
@@ -261,15 +261,8 @@ def _plan(model: UserModel) -> _Plan:
 
 def _law(correction: Correction, *, has_velocity: bool) -> tuple[bytes, dict[str, int]]:
     """C code of the law and the sizes of its arrays."""
-    import casadi as ca
-
     law = law_function(correction.model, has_velocity=has_velocity)
-    generator = ca.CodeGenerator("corrected_law", {"with_header": False})
-    generator.add(law)
-    with tempfile.TemporaryDirectory(prefix="irj-code-") as folder:
-        generator.generate(f"{folder}/")
-        code = (Path(folder) / "corrected_law.c").read_bytes()
-    return code, {
+    return model_code("corrected_law", [law]), {
         "NS": law.numel_in(0),
         "NP": law.numel_in(2),
         "SZ_ARG": law.sz_arg(),

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, final
 
 import numpy as np
@@ -39,6 +37,7 @@ from identification.online.watch import DRIVE, READINGS, TAU
 from identification.recursive.prior_start import PRIOR_PASSES, UNDETERMINED
 from irj_fmu.estimator.native_expressions import cheaper
 from irj_fmu.fmi import slave_base
+from irj_fmu.fmi.compiler import model_code
 from irj_fmu.fmi.variables import Variable
 
 FloatArray = npt.NDArray[np.float64]
@@ -83,7 +82,7 @@ def generate(joint: Joint, made: OnlineEstimator, variables: Sequence[Variable],
     header.define("SZ_RES", max(8, *(f.sz_res() for f in functions)))
     header.define("SZ_IW", max(f.sz_iw() for f in functions))
     header.define("SZ_W", max(f.sz_w() for f in functions))
-    return Code(_model(functions), header.text())
+    return Code(model_code("native_model", functions), header.text())
 
 
 # --- CasADi's functions ---------------------------------------------------------------------------
@@ -103,17 +102,6 @@ def _functions(made: OnlineEstimator) -> list[Any]:
         recursion.append(ca.Function(name, arguments, function.call(arguments)))
     laws = zip(("points", "slopes", "sample_observer"), found[2:], strict=False)
     return [*recursion, *own, *(cheaper(function, name) for name, function in laws)]
-
-
-def _model(functions: Sequence[Any]) -> bytes:
-    import casadi as ca
-
-    generator = ca.CodeGenerator("native_model", {"with_header": False})
-    for function in functions:
-        generator.add(function)
-    with tempfile.TemporaryDirectory(prefix="irj-code-") as folder:
-        generator.generate(f"{folder}/")
-        return (Path(folder) / "native_model.c").read_bytes()
 
 
 # --- text -----------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -16,10 +17,11 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import final
+from typing import Any, final
 
 from identification.errors import InputError
 from identification.recursive.compiler import compiler_identity, kept
+from identification.scratch import outer_folder
 from irj_fmu.command_line import checkpoint
 
 
@@ -45,6 +47,8 @@ TARGETS = {
     )
 }
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-w")
+_FULL = re.compile("No space left|File too large|File size limit|quota exceeded", re.IGNORECASE)
+"""What compilers say where a disk, or a user's share of it, takes no more."""
 _NO_COMPILER = (
     "no C compiler found for {target}: estimator FMUs still build, plant FMUs need "
     "one; run `pip install ziglang`, or install gcc and pass cc='gcc'"
@@ -211,8 +215,15 @@ def _compiled(
 ) -> bytes:
     """What the command makes of the sources, in a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="irj-build-") as folder:
-        for name, content in sources.items():
-            (Path(folder) / name).write_bytes(content)
+        no_room = (
+            f"compiler {words[0]!r} has no room for its files in {outer_folder()}; free some "
+            "space there, or name another folder with TMPDIR"
+        )
+        try:
+            for name, content in sources.items():
+                (Path(folder) / name).write_bytes(content)
+        except OSError:
+            raise InputError(no_room) from None
         try:
             done = subprocess.run(
                 words,
@@ -227,6 +238,8 @@ def _compiled(
                 f"compiler {words[0]!r} cannot be started ({error.strerror}); check `cc`"
             ) from error
         if done.returncode != 0:
+            if _FULL.search(done.stderr):
+                raise InputError(no_room)
             first = next(
                 (line for line in done.stderr.splitlines() if "error" in line),
                 done.stderr.strip()[:200],
@@ -237,6 +250,19 @@ def _compiled(
                 "another one with --cc"
             )
         return (Path(folder) / library).read_bytes()
+
+
+def model_code(name: str, functions: Sequence[Any]) -> bytes:
+    """C code of CasADi functions, its inner names made of `name`.
+
+    It is taken from memory: a file that CasADi writes on a full disk ends early without a word.
+    """
+    import casadi as ca
+
+    generator = ca.CodeGenerator(name, {"with_header": False})
+    for function in functions:
+        generator.add(function)
+    return str(generator.dump()).encode()
 
 
 def universal_library(x86_64: bytes, aarch64: bytes) -> bytes:

@@ -19,6 +19,7 @@ from casadi_models import JointModel
 from casadi_models.functions import JointFunctions
 from casadi_models.parameter import Parameter
 from casadi_models.quantities import linear_unit
+from casadi_models.text.compensation import RestingLoad, resting_load
 from casadi_models.text.shown import shown
 from identification.data.channels import channel_unit
 from identification.data.joint_file import Joint
@@ -34,6 +35,10 @@ REFERENCE: Final = ("reference_position", "reference_velocity", "reference_accel
 BANDWIDTH: Final = 30.0
 """Bandwidth of the position controller's default gains [rad/s]; its damping ratio is 0.8."""
 _DAMPING: Final = 0.8
+LONGEST_NAME: Final = 100
+"""Characters of an FMU's name that come from the joint's: with what kind, endings and temporary
+files put around it a file name stays within the 255 bytes of file systems.
+"""
 _MOTOR: Final = ("motor_position", "motor_velocity")
 _LINK_POSITION, _LINK_VELOCITY = (CHANNELS.index(n) for n in ("link_position", "link_velocity"))
 
@@ -64,8 +69,9 @@ class PlantOptions:
     tolerance : float
         Relative tolerance of the integrator where the host names none.
     payload: bool
-        True: inputs ``payload_inertia`` and, where the model has gravity, ``payload_weight`` add to
-        the link's; a payload that is taken up or put down while the plant runs.
+        True: inputs ``payload_inertia`` and, where the model has gravity, ``payload_weight`` and
+        ``payload_weight_cosine`` (sine and cosine part) add to the link's; a payload that is taken
+        up or put down while the plant runs.
     """
 
     drive: Drive | None = None
@@ -79,8 +85,8 @@ class PlantOptions:
 
 
 def identifier(name: str) -> str:
-    """Return a C identifier made of a name."""
-    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or "joint"
+    """Return a C identifier made of a name, at most `LONGEST_NAME` characters of it."""
+    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[:LONGEST_NAME] or "joint"
     return f"joint_{made}" if made[0].isdigit() else made
 
 
@@ -218,8 +224,11 @@ class _Builder:
         if not self.options.payload:
             return {}
         added = {self.model.inertias[-1]: ("payload_inertia", "Inertia of the payload.")}
-        for name in self.model.named("weight")[:1]:
-            added[name] = ("payload_weight", "Gravity torque of the payload at a level link.")
+        upright = self.model.named("weight")
+        level = tuple(n for n in self.model.weights if n not in upright)
+        for part, names in (("", upright), ("_cosine", level)):
+            text = f"Gravity torque of the payload, its {part[1:] or 'sine'} part."
+            added |= dict.fromkeys(names[:1], (f"payload_weight{part}", text))
         units = {p.name: p.unit for p in self.own_parameters}
         return {
             name: Variable(title, units[name], description=text)
@@ -314,7 +323,7 @@ class _Builder:
             start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
             inertia = sum(start[n] for n in self.model.inertias)
             damping = 2 * _DAMPING * inertia * BANDWIDTH
-            weight = sum(start[n] for n in self.model.named("weight"))
+            load = resting_load(self.model)
             unit = self._unit
             stiff = self._parameter(
                 "controller.stiffness",
@@ -337,17 +346,32 @@ class _Builder:
                 "Feed-forward of the reference acceleration.",
                 0.0,
             )
-            hold = self._parameter(
+            sine = self._parameter(
                 "controller.gravity",
                 unit("N.m"),
-                weight,
-                "Feed-forward of gravity; positive is upright at zero.",
+                load.sine,
+                "Feed-forward of gravity, its sine part; positive is upright at zero.",
+            )
+            cosine = self._parameter(
+                "controller.gravity_cosine",
+                unit("N.m"),
+                load.cosine,
+                "Feed-forward of gravity, its cosine part: all of it where the link is level at "
+                "zero.",
+            )
+            constant = self._parameter(
+                "controller.constant",
+                unit("N.m"),
+                load.constant,
+                "Feed-forward of a load that is always the same: the weight of a linear axis, an "
+                "offset of the drive.",
             )
             limit = self._parameter(
                 "controller.limit", unit("N.m"), 1e9, "Largest drive torque, link-referred.", 0.0
             )
             q, v, a = self._reference(u, clock)
-            wish = stiff * (q - x[0]) + damp * (v - x[1]) + feed * a - hold * ca.sin(q)
+            held = RestingLoad(sine, cosine, constant).drive(q)
+            wish = stiff * (q - x[0]) + damp * (v - x[1]) + feed * a + held
             return ca.fmin(limit, ca.fmax(-limit, wish))
         if self.by_current:
             constant = self._parameter(

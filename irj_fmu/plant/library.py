@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from irj_fmu.fmi.compiler import (
     compile_library,
     find_compiler,
     header_folder,
+    model_code,
 )
 from irj_fmu.fmi.documentation import Note, beside
 from irj_fmu.fmi.model_description import Description, Entry, model_description, to_bytes
@@ -209,19 +209,13 @@ def _generate(spec: PlantSpec) -> tuple[bytes, dict[str, int]]:
             for name, size in (("x", nx), ("z", nz), ("u", nu), ("p", np_), ("x_prev", nx))
         ]
         functions.append(ca.Function("model_z", args, [ca.densify(function(*args))]))
-    generator = ca.CodeGenerator("plant_model", {"with_header": False})
-    for function in functions:
-        generator.add(function)
-    with tempfile.TemporaryDirectory(prefix="irj-code-") as folder:
-        generator.generate(f"{folder}/")
-        code = (Path(folder) / "plant_model.c").read_bytes()
     limits = {
         "SZ_ARG": max(8, *(f.sz_arg() for f in functions)),
         "SZ_RES": max(2, *(f.sz_res() for f in functions)),
         "SZ_IW": max(f.sz_iw() for f in functions),
         "SZ_W": max(f.sz_w() for f in functions),
     }
-    return code, limits
+    return model_code("plant_model", functions), limits
 
 
 def _expanded(function: ca.Function) -> tuple[ca.Function, Any]:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.text.compensation import friction_compensation
+from casadi_models.text.compensation import friction_compensation, resting_load
+from casadi_models.text.typed_law import TypedLaw, register
 from workbench.cli.main import main
 
 FRICTION = sorted(k for k, e in EFFECTS.items() if e.family == "friction" and not e.states)
@@ -120,3 +121,31 @@ def test_c_and_casadi_have_the_function(tmp_path: Path) -> None:
     loaded_function = ca.Function.load(str(tmp_path / "f" / "friction_compensation.casadi"))
     model = JointModel(gear_ratio=50.0).add("viscous@motor").with_values({"motor_viscous": 2.0})
     assert float(loaded_function(0.0, 3.0, 0.0, 0.0, model.value_vector())) == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("kind", ["rotary", "linear"])
+def test_the_load_at_rest_keeps_a_joint_where_it_stands(kind: str) -> None:
+    """With it as the drive nothing accelerates, wherever the joint stands: both parts of gravity,
+    an offset of the drive and a constant of the user's own.
+    """
+    with EFFECTS.scoped():
+        unit = "N.m" if kind == "rotary" else "N"
+        constant = register(TypedLaw("pull", "c", ("link",), (f"c=-9..9 {unit}",), kind))
+        model = loaded(
+            JointModel(gear_ratio=50.0, kind=kind)
+            .add("coulomb")
+            .add("gravity")
+            .add("current_offset")
+            .add(constant.key)
+        )
+        load, p = resting_load(model), model.value_vector()
+        for q in (0.0, 0.7, -2.1):
+            rates = model.functions.dynamics([q, 0.0], [load.drive(q), 0.0, 0.0], p)
+            assert float(rates[1]) == pytest.approx(0.0, abs=1e-12)
+        assert load.sine and load.cosine and load.constant
+
+
+def test_springs_are_no_constant_load() -> None:
+    model = loaded(JointModel(gear_ratio=50.0).add("added_spring@motor").add("cyclic_torque"))
+    load = resting_load(model)
+    assert (load.sine, load.cosine, load.constant) == (0.0, 0.0, 0.0)

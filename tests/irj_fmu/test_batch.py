@@ -397,6 +397,23 @@ def test_goes_on_after_the_end(
         assert (out / name).read_bytes() == (in_one_go / name).read_bytes()
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
+@pytest.mark.parametrize("after", [0.0, 0.1, 0.3])
+def test_an_interrupt_while_the_workers_load_is_one_line(after: float, folder: Path) -> None:
+    """A terminal sends it to them as well, and one that still loads its modules printed a trace."""
+    path, out = write(folder, **LONG_STUDY), folder / "out"  # type: ignore[arg-type]
+    process = start(path, out)
+    try:
+        wait_for(lambda: len(members(process.pid)) >= 3)  # one keeps track, one starts the others
+        time.sleep(after)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+    finally:
+        if members(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert (process.returncode, said) == (130, "irj: interrupted\n")
+
+
 def test_a_torn_chunk_is_run_again(folder: Path) -> None:
     path = write(folder, count=6, more="chunk = 2")
     run_study(path, jobs=1)

@@ -21,7 +21,7 @@ from irj_fmu.effect_table import joint_with, readings_of
 from irj_fmu.host.exchange import Exchange, simulate_me
 from irj_fmu.host.run import Fmu, Instance, Trajectory, Wiring, simulate_cs
 from irj_fmu.host.signals import Table
-from irj_fmu.plant.joint import PlantOptions, plant_spec
+from irj_fmu.plant.joint import BANDWIDTH, PlantOptions, plant_spec
 from irj_fmu.plant.library import build_plant
 from irj_fmu.plant.reference import Motion, reference_joint
 
@@ -263,6 +263,66 @@ def test_controller_follows_its_motion(tmp_path: Path) -> None:
     assert np.abs(still["p.link_position"]).max() < 1e-12
 
 
+LOADS = {"gravity_torque": 60.0, "gravity_cosine": -35.0, "current_offset": 4.0}
+HELD = {
+    "sine and cosine": ("hd1", "rotary", ("gravity",)),
+    "of an elastic joint": ("hd3", "rotary", ("gravity",)),
+    "a linear axis that stands upright": ("hd1", "linear", ("viscous", "current_offset")),
+    "everything": ("hd1", "rotary", ("gravity", "current_offset")),
+}
+
+
+@pytest.mark.parametrize("case", HELD)
+def test_the_controller_holds_the_joint_where_it_stands(case: str, tmp_path: Path) -> None:
+    """Wherever its zero is: a tenth of the load that is not fed forward would move it by more."""
+    import fmpy
+
+    model_name, kind, effects = HELD[case]
+    joint = Joint(
+        name="held",
+        kind=kind,
+        gear_ratio=100.0 if kind == "rotary" else 1.0,
+        model_name=model_name,
+        effects=effects,
+        fitted={"motor_inertia": 0.5, "link_inertia": 0.5}
+        | ({"stiffness": 1e6} if model_name == "hd3" else {}),
+    )
+    names = joint.model().parameter_names
+    values = {n: v for n, v in LOADS.items() if n in names}
+    joint = replace(joint, fitted={**joint.fitted, **values})
+    path = built(tmp_path, joint, controller=True)
+    stiff = BANDWIDTH**2 * (0.5 + 0.5)
+    states = ("state.motor_position", "state.link_position")
+    for place in (0.0, 0.8):
+        with Fmu(path) as fmu:
+            start = {n: place for n in (*states, "state.position") if n in fmu.variables}
+        found = fmpy.simulate_fmu(
+            str(path),
+            fmi_type="CoSimulation",
+            stop_time=2.0,
+            output_interval=0.01,
+            start_values={**start, "reference_position": place},
+            output=["motor_position"],
+        )
+        moved = found["motor_position"] / joint.gear_ratio - place
+        assert np.abs(moved).max() < 0.1 * min(map(abs, values.values())) / stiff
+
+
+def test_a_payload_has_both_parts(tmp_path: Path) -> None:
+    """Its weight adds to the link's parts, one by one: the payload that undoes the link's weight
+    leaves it where it is.
+    """
+    joint = Joint(name="pay", model_name="hd1", gear_ratio=1.0, effects=("gravity",))
+    values = {"motor_inertia": 0.5, "link_inertia": 0.5, "gravity_torque": 7.0}
+    joint = replace(joint, fitted={**values, "gravity_cosine": -3.0})
+    path = built(tmp_path, joint, payload=True)
+    weight = {"p.payload_weight": -7.0, "p.payload_weight_cosine": 3.0}
+    still = run(path, ["link_position"], 300, parameters={**weight, "p.state.position": 0.4})
+    assert np.abs(still["p.link_position"] - 0.4).max() < 1e-9
+    falling = run(path, ["link_position"], 300, parameters={"p.state.position": 0.4})
+    assert np.ptp(falling["p.link_position"]) > 1e-3
+
+
 def test_sensors(tmp_path: Path) -> None:
     """Noise of the deviation asked for, quanta, a bias in its time, a dropout; the same again
     at each run.
@@ -325,6 +385,14 @@ def test_fitted_joint_with_added_effects(tmp_path: Path) -> None:
     assert np.isfinite(
         run(path, ["link_position"], 50, parameters={"p.i_m": 5.0})["p.link_position"]
     ).all()
+
+
+def test_a_joint_with_a_long_name_has_an_fmu(tmp_path: Path) -> None:
+    """The name is a file's, too; a long one was refused as a full disk."""
+    joint = replace(reference_joint("hd1"), name="Achse, " * 60)
+    path = built(tmp_path, joint)
+    assert path.name.startswith("Achse_Achse")
+    assert path.stat().st_size > 0
 
 
 def test_linear_axis_has_linear_units(tmp_path: Path) -> None:

@@ -318,6 +318,25 @@ def test_output_in_a_folder_that_is_not_there(said: Say, tmp_path: Path) -> None
         assert f"{tmp_path / 'none'}: no such folder" in line
 
 
+@pytest.mark.parametrize("letters", [83, 84])
+def test_output_with_a_name_as_long_as_a_file_system_takes(
+    letters: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """254 bytes; what it is written to first has a longer name only where that is cut. 257 bytes
+    are refused before the work.
+    """
+    path, out = write_csv(tmp_path / "run.csv", good()), tmp_path / f"{letters * '关'}.json"
+    before = sorted(tmp_path.iterdir())
+    assert main(["check", str(path), "--json", str(out)]) == (0 if letters == 83 else 2)
+    said = capsys.readouterr()
+    if letters == 83:
+        assert out.stat().st_size > 0
+    else:
+        assert "File name too long" in said.err
+        assert said.out == ""
+    assert sorted({*tmp_path.iterdir()} - {out}) == before
+
+
 def test_output_that_is_a_folder(said: Say, tmp_path: Path) -> None:
     path = write_csv(tmp_path / "run.csv", good())
     assert "is a folder; give the name of a file" in said(

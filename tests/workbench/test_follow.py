@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import threading
 import time
@@ -222,6 +223,39 @@ def test_a_stream_gives_what_the_file_gives(joint_file: Path, tmp_path: Path) ->
     assert [e.verdict for _, e in streamed[-1].verdicts] == [e.verdict for _, e in whole.verdicts]
     last, sigma = streamed[-1].values[-1], streamed[-1].sigmas[-1]
     assert (np.abs(last - whole.values[-1]) < 0.1 * sigma).all()
+
+
+@pytest.mark.parametrize("bad", ["1,2,3", "ERROR: logger restarted", "5.0,x,0,0,0,0,0"])
+@pytest.mark.parametrize("first", [True, False], ids=["first of its part", "within its part"])
+def test_a_line_that_cannot_be_used_ends_it_and_what_came_is_told(
+    bad: str,
+    first: bool,
+    joint_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The line has the number that it has in the file, and hours before it are not lost."""
+    path, text, out = tmp_path / "live.csv", lines(faulty=False), tmp_path / "live.json"
+    cut, at = 1500, 1500 if first else 1700
+    parts = [text[:cut], [*text[cut:at], bad, *text[at:2000]]]
+    path.write_text("\n".join(parts[0]) + "\n")
+
+    def write() -> None:
+        time.sleep(1.0)
+        with path.open("a") as stream:
+            stream.write("\n".join(parts[1]) + "\n")
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    command = ["track", str(path), "--joint", str(joint_file), "--follow", "5", "--json", str(out)]
+    assert main(command) == 2
+    thread.join()
+    said = capsys.readouterr()
+    assert said.err.startswith(f"irj: {path}, line {at + 1}")
+    assert len(said.err.splitlines()) == 1
+    assert "No reading was doubted" in said.out
+    followed_to = json.loads(out.read_text())["records"][0]
+    assert followed_to["record"] == "live"
 
 
 def test_a_stream_that_cannot_be_is_said_in_one_line(

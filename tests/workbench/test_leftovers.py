@@ -212,3 +212,23 @@ def test_a_lock_that_is_given_back_leaves_nothing(tmp_path: Path) -> None:
     assert len(list(outer.rglob("*"))) == 2, "killed"
     with scratch.own_folder():
         assert list(outer.glob("irj-locks-*")) == []
+
+
+def test_a_folder_is_held_whatever_folder_has_the_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two servers on the same sessions, started from desktop and service, each had its own."""
+    held, mine, theirs = (tmp_path / name for name in ("session", "mine", "theirs"))
+    for folder in (held, mine, theirs):
+        folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(theirs))
+    process = other(f"scratch.hold(Path({str(held)!r}))")
+    monkeypatch.setattr(tempfile, "tempdir", str(mine))
+    try:
+        with pytest.raises(InputError, match="another irj is writing it"):
+            scratch.hold(held)
+        assert list(mine.rglob("irj-locks-*/*")) == [], "what was refused holds nothing"
+    finally:
+        end(process)
+    scratch.hold(held)
+    assert list(held.iterdir()) == []

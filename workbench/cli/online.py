@@ -101,7 +101,7 @@ def _run_follow(arguments: Namespace, joint: Joint) -> int:
     if not arguments.follow > 0:
         raise InputError(f"--follow {arguments.follow:g}: give seconds above 0")
     healthy, warnings = open_records(arguments.healthy, joint)
-    said, made = 0, None
+    said, made, broken = 0, None, None
     with followed_source(arguments.records[0], joint) as source:
         try:
             for made in follow(
@@ -114,12 +114,18 @@ def _run_follow(arguments: Namespace, joint: Joint) -> int:
                 said = len(made.verdicts)
         except KeyboardInterrupt:
             sys.stderr.write("irj: stopped; this is what came until then\n")
+        except InputError as error:  # hours may have come before a line that cannot be used
+            broken = error
     if made is None:
+        if broken is not None:
+            raise broken
         return 130
     result = made.as_json()
     _print_track(result)
     print(f"  {standing(made.verdicts, watched=made.watched)}")
     write_json(arguments.json, {"records": [result], "warnings": warnings})
+    if broken is not None:
+        raise broken
     return 1 if arguments.fail_on_fault and result["events"] else 0
 
 

@@ -19,7 +19,7 @@ from workbench.page.charts.choices import held_text, known_entry, windows_of
 from workbench.page.desk.tree import LONGEST_NAME, given, opened, remarked, used_files
 from workbench.page.live import SOON, Live
 from workbench.page.records import guessed_role, surveyed
-from workbench.page.session import FileEntry, State
+from workbench.page.session import FileEntry, State, stored_as
 
 LARGEST_JOINT: Final = 1 << 20
 NUMBERS: Final = {key.name: key for key in JOINT.keys if key.kind == "number"}
@@ -214,6 +214,14 @@ def _plausible(value: Any, key: str) -> float:
 def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
     """Set the joint from a joint file's text, or from the fields of the form.
 
+    Where the body holds ``was``, the text that was edited, the joint is set only if it is still
+    that one.
+
+    Returns
+    -------
+    mapping
+        ``text`` of the joint and the status of each of the ``files``.
+
     Raises
     ------
     InputError
@@ -228,11 +236,21 @@ def set_joint(live: Live, body: Mapping[str, Any]) -> dict[str, Any]:
         text = tables_text(_from_form(body, _previous(live.state.joint_text)))
     parse_joint(from_toml(text, source), source)
     before = given(live.state)
-    changed = live.change_input(lambda s: replace(s, joint_text=text, joint_source=source))
+
+    def put(s: State) -> State:
+        if body.get("was", s.joint_text) != s.joint_text:
+            raise InputError(
+                "the joint was changed elsewhere while it was edited here; say on the Model page "
+                "which of the two counts"
+            )
+        return replace(s, joint_text=text, joint_source=source)
+
+    changed = live.change_input(put)
     if given(changed) != before:
         made = {f.id: live.examine(f) for f in changed.files}
         live.change_input(lambda s: replace(s, files=tuple(made.get(f.id, f) for f in s.files)))
-    return {"ok": True, "files": [{"id": f.id, "status": f.status} for f in live.state.files]}
+    files = [{"id": f.id, "status": f.status} for f in live.state.files]
+    return {"ok": True, "text": text, "files": files}
 
 
 def _previous(text: str) -> dict[str, Any]:
@@ -353,7 +371,7 @@ def start_demo(live: Live) -> dict[str, Any]:
     if live.state.files:
         raise InputError("the session has records already; start a new one for the demo")
     for name, content in demo_files().items():
-        stored = f"{secrets.token_hex(4)}-{name}"
+        stored = stored_as(name)
         (live.session.files / stored).write_bytes(content)
         add_upload(live, name, stored, len(content))
     return {"ok": True}

@@ -68,6 +68,8 @@ class Live(Place):
     ----------
     session : Session
         Its folder; everything here is made from it again after a restart.
+    sources : tuple of str
+        What the Replay page may follow, as the server was told at its start.
 
     Attributes
     ----------
@@ -80,8 +82,9 @@ class Live(Place):
         Set when the newest record was drawn: the check gate lets that go first.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, sources: tuple[str, ...] = ()) -> None:
         super().__init__(session, session.load())
+        self.sources = sources
         self.job: Job | None = None
         self.error: str | None = None
         self.begun = ""

@@ -23,7 +23,7 @@ from workbench.cli.following.growing import follow as growing
 from workbench.cli.following.source import source as followed_source
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
-from workbench.page.desk.sources import source_of, stopped
+from workbench.page.desk.sources import stopped
 from workbench.page.jobs.place import Place
 from workbench.page.session import StepEntry, write_atomic
 from workbench.show.replayed import READINGS, Replay, standing
@@ -145,19 +145,18 @@ def replay(
 
 
 def follow(
-    live: Place, steps: Sequence[StepEntry], name: str, folder: Path, progress: Progress
+    live: Place, steps: Sequence[StepEntry], path: str, folder: Path, progress: Progress
 ) -> Path:
-    """Follow a file that is being written with the fitted joint; the result in `folder` is written
-    anew as it grows.
+    """Follow a file that is being written, or a stream, with the fitted joint; the result in
+    `folder` is written anew as it grows. The server has asked whether it may be followed.
 
     Raises
     ------
     InputError
-        Nothing is fitted; the file may not be followed, or cannot be used.
+        Nothing is fitted; the file cannot be used.
     """
     if not steps:
         raise InputError("follow: fit first, the estimator starts from the fitted joint")
-    path = source_of(live.session.folder.parent, name)
     short = Path(path).name
     joint = parse_joint(from_toml(live.analysis().to_joint_file(), "joint"), "joint")
     why, made, written, shown = "", None, 0.0, -math.inf
@@ -177,13 +176,18 @@ def follow(
     (folder / FILE).unlink(missing_ok=True)
     with followed_source(path, joint) as source:
         progress(f"waiting for {short}", 0.0)  # from here on nothing of a stream is lost
-        for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
-            now = float(made.record.time[-1])
-            progress(f"following {short}, {now:.0f} s", 0.0)
-            fresh = now > shown and time.monotonic() - written > REWRITTEN
-            if len(made.time) and fresh:
-                written, shown = time.monotonic(), now
-                _kept(folder, made, steps, {"no_detector": why, "live": True})
+        try:
+            for made in growing(source, joint, state_of, stop=lambda: stopped(folder)):
+                now = float(made.record.time[-1])
+                progress(f"following {short}, {now:.0f} s", 0.0)
+                fresh = now > shown and time.monotonic() - written > REWRITTEN
+                if len(made.time) and fresh:
+                    written, shown = time.monotonic(), now
+                    _kept(folder, made, steps, {"no_detector": why, "live": True})
+        except InputError:  # what came before a line that cannot be used stays
+            if made is not None:
+                _kept(folder, made, steps, {"no_detector": why})
+            raise
     if made is None:
         raise InputError(f"follow: nothing came into {short}; start the recording first")
     return _kept(folder, made, steps, {"no_detector": why})

@@ -11,7 +11,6 @@ import importlib
 import json
 import logging
 import os
-import secrets
 import shutil
 import socket
 import sys
@@ -19,7 +18,7 @@ import threading
 import webbrowser
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, final
@@ -57,7 +56,7 @@ from workbench.page.jobs.place import folder_of
 from workbench.page.jobs.process import warm_up
 from workbench.page.live import BusyError, Live
 from workbench.page.security import Guard, loopback_hosts
-from workbench.page.session import Session, Store, safe_name
+from workbench.page.session import Session, Store, naming, safe_name, stored_as
 from workbench.page.uploads import MAX_UPLOAD, TooLargeError, refuse_size, stream_to
 from workbench.page.views import VIEWS, first_plot
 
@@ -91,12 +90,13 @@ PAGE: Final = {
 @final
 @dataclass
 class Service:
-    """The sessions of one server."""
+    """The sessions of one server, and what their Replay page may follow."""
 
     store: Store
     max_upload: int
-    lives: OrderedDict[str, Live]
-    lock: threading.Lock
+    sources: tuple[str, ...] = ()
+    lives: OrderedDict[str, Live] = field(default_factory=OrderedDict)
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def live(self, identifier: str) -> Live:
         """A session by its identifier.
@@ -127,7 +127,7 @@ class Service:
         """A session of this server's own: a second one would write over what the first has done."""
         _held(session)
         try:
-            return Live(session)
+            return Live(session, self.sources)
         except BaseException:
             release(session.folder)
             raise
@@ -309,7 +309,7 @@ async def _upload(request: Request, live: Live, limit: int, store: Store) -> Res
     announced = int(request.headers.get("content-length", "0") or 0)
     refuse_size(name, announced, limit, live.session.files)
     await run_in_threadpool(home.refuse_over, store, name, announced)
-    stored = f"{secrets.token_hex(4)}-{name}"
+    stored = stored_as(name)
     path = live.session.files / stored
     size = await stream_to(path, request.stream(), limit)
 
@@ -400,6 +400,7 @@ def create_app(
     port: int = 8765,
     max_upload: int = MAX_UPLOAD,
     hosts: frozenset[str] | None = None,
+    follow: Sequence[str | Path] = (),
 ) -> Guard:
     """The application.
 
@@ -413,8 +414,15 @@ def create_app(
         Largest upload in bytes.
     hosts : set of str, optional
         Host headers in place of the loopback names.
+    follow : sequence of path
+        Files that are being written, and addresses of streams, which the Replay page may follow.
+
+    Raises
+    ------
+    InputError
+        One of them cannot be followed.
     """
-    service = Service(Store(root), max_upload, OrderedDict(), threading.Lock())
+    service = Service(Store(root), max_upload, sources.named(follow))
     home.sweep_empty(service.store)
 
     async def page(request: Request) -> Response:
@@ -498,7 +506,7 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
     Raises
     ------
     InputError
-        A file that does not exist.
+        A file that does not exist, or that cannot be read; no session is left then.
     """
     store = Store(root)
     for file in files:
@@ -510,12 +518,18 @@ def with_files(root: Path, files: Sequence[str | Path]) -> str:
             )
     session = store.create()
     live = Live(session)
-    for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
-        name = safe_name(file.name)
-        stored = f"{secrets.token_hex(4)}-{name}"
-        shutil.copyfile(file, session.files / stored)
-        with live.library():
-            add_upload(live, name, stored, file.stat().st_size)
+    try:
+        for file in sorted(map(Path, files), key=lambda f: f.suffix != ".toml"):
+            name = safe_name(file.name)
+            stored = stored_as(name)
+            with naming(session.files / stored):
+                shutil.copyfile(file, session.files / stored)
+            with live.library():
+                add_upload(live, name, stored, file.stat().st_size)
+    except BaseException:  # a session that nobody is told of would keep the files for ever
+        live.close()
+        shutil.rmtree(session.folder, ignore_errors=True)
+        raise
     return session.id
 
 
@@ -553,7 +567,7 @@ def serve(
     with _listen(port) as listening:
         port = int(listening.getsockname()[1])
         key = home.key_of(Store(folder))
-        sources.allow(folder, follow)
+        app = create_app(folder, port=port, follow=follow)
         tail = f"#home={key}" + (f"&session={with_files(folder, files)}" if files else "")
         address = f"http://127.0.0.1:{port}/{tail}"
         if say is not None:
@@ -562,7 +576,7 @@ def serve(
             sys.stdout.write(address + "\n")
             sys.stdout.flush()
         config = uvicorn.Config(
-            create_app(folder, port=port),
+            app,
             log_level="warning",
             access_log=False,
             server_header=False,

@@ -14,26 +14,40 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Mapping
+import unicodedata
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, Final, final
 
 from identification.errors import InputError
-from identification.scratch import hold, sweep
+from identification.scratch import hold, part_of, sweep
 
 VERSION: Final = 1
 _ID: Final = re.compile(r"^[0-9a-f]{32}$")
-_UNSAFE: Final = re.compile(r"[^A-Za-z0-9._ -]+")
+_FORBIDDEN: Final = frozenset('<>:"/\\|?*')
+"""Of the printable characters those that one of the systems keeps for itself."""
+_UNSEEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
+"""Kinds of characters that show nothing or turn what stands about them: two names would look the
+same, or one would end differently than it looks.
+"""
+_JOINERS: Final = frozenset("\u200c\u200d")
+"""Unseen, too, but spelling in some scripts."""
+_RESERVED: Final = re.compile(r"(CON|PRN|AUX|NUL|(COM|LPT)[1-9¹²³])\s*(\..*)?", re.IGNORECASE)
+"""Devices of one of the systems, with any ending."""
+LONGEST_FILE: Final = 200
+"""Bytes of a name in UTF-8: file systems take 255, and something is put before it."""
+_ENDING: Final = 20
+"""Bytes of the endings of a name that a cut keeps, which say how it is read."""
 
 
 def write_atomic(path: Path, content: bytes) -> None:
     """Write a file so that a reader, or a crash, sees the old content or the new one, never a
     part.
     """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    temporary = part_of(path)
     try:
-        with temporary.open("wb") as stream:
+        with naming(path), temporary.open("wb") as stream:
             stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
@@ -42,14 +56,57 @@ def write_atomic(path: Path, content: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Say where it was where a disk takes no more: the system names a file only where it cannot be
+    opened.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
 def safe_name(name: str) -> str:
-    """The name of an upload as a file name: no folder, no leading dot, at most 100 characters."""
-    last = name.replace("\\", "/").rsplit("/", 1)[-1]
-    kept = _UNSAFE.sub("_", last).strip(" .")
-    stem, dot, tail = kept.rpartition(".")
-    if len(kept) > 100:
-        kept = f"{stem[: 99 - len(tail)]}{dot}{tail}" if len(tail) < 20 else kept[:100]
-    return kept or "record"
+    """The name of an upload as a file name: letters of all scripts as they are, no folder, no
+    leading dot, nothing that a file system or a reader would take for something else, at most
+    `LONGEST_FILE` bytes. Two spellings of the same letters (NFC and NFD) are one name.
+    """
+    last = unicodedata.normalize("NFC", name).replace("\\", "/").rpartition("/")[2]
+    kept = "".join(c if _stays(c) else "_" for c in last).strip(" .").strip().strip(" .")
+    kept = f"_{kept}" if _RESERVED.fullmatch(kept) else kept
+    return _cut(kept) or "record"
+
+
+def _stays(character: str) -> bool:
+    kind = unicodedata.category(character)
+    return character in _JOINERS or not (character in _FORBIDDEN or kind in _UNSEEN)
+
+
+def _cut(name: str) -> str:
+    """A name of `LONGEST_FILE` bytes at most, cut before its endings and between two letters."""
+    if len(name.encode()) <= LONGEST_FILE:
+        return name
+    ending = "".join(PurePosixPath(name).suffixes[-2:])
+    if len(ending.encode()) > _ENDING:
+        ending = PurePosixPath(name).suffix
+    if len(ending.encode()) > _ENDING:
+        ending = ""
+    stem = name.removesuffix(ending).encode()[: LONGEST_FILE - len(ending.encode())]
+    return stem.decode(errors="ignore").rstrip(" .") + ending
+
+
+def stored_as(name: str) -> str:
+    """The name under which an upload lies in the session folder: no other one has it. Letters that
+    the file system of this machine cannot write are left out there; the page has them still.
+    """
+    try:
+        os.fsencode(name)
+    except UnicodeEncodeError:
+        name = name.encode("ascii", "replace").decode().replace("?", "_")
+    return f"{secrets.token_hex(4)}-{name}"
 
 
 @final

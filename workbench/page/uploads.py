@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import zipfile
 import zlib
 from collections.abc import AsyncIterator
@@ -11,6 +10,8 @@ from shutil import disk_usage
 from typing import Any, Final
 
 from identification.errors import InputError
+from identification.scratch import part_of
+from workbench.page.session import naming
 
 MAX_UPLOAD: Final = 1 << 30
 """Largest upload in bytes."""
@@ -55,10 +56,10 @@ async def stream_to(path: Path, chunks: AsyncIterator[bytes], limit: int) -> int
     TooLargeError
         More than `limit` bytes came.
     """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    part = part_of(path)
     size = 0
     try:
-        with part.open("wb") as stream:
+        with naming(path), part.open("wb") as stream:
             async for chunk in chunks:
                 size += len(chunk)
                 if size > limit:

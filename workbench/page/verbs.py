@@ -9,6 +9,7 @@ from typing import Any, Final
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.desk import tree
+from workbench.page.desk.sources import refuse_other
 from workbench.page.jobs.place import Change
 from workbench.page.live import Live
 from workbench.page.session import State
@@ -52,6 +53,8 @@ def run(live: Live, action: str, body: Mapping[str, Any]) -> None:
         raise InputError(f"unknown action {action!r}; known: {', '.join(texts)}")
     if action in ("add", "remove") and not label:
         raise InputError(f"{action}: say which effect")
+    if action == "follow":
+        refuse_other(live.sources, str(body.get("source", "")))
     move = _MOVES.get(action)
     live.start(
         action,

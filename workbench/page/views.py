@@ -27,7 +27,6 @@ from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, si
 from workbench.page.charts.choices import known_fields
 from workbench.page.charts.payload import payload_view
 from workbench.page.desk import tree
-from workbench.page.desk.sources import allowed
 from workbench.page.input import joint_form
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
@@ -166,7 +165,7 @@ def _replay(live: Live, query: Query) -> dict[str, Any]:
         "sensors": app_replay.READINGS,
         "faults": app_replay.TRIED,
         "seconds": app_replay.MOST_SECONDS,
-        "sources": allowed(live.session.folder.parent),
+        "sources": live.sources,
     }
 
 

@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -258,6 +258,7 @@ function render(moved) {
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
     const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
+    const caret = focused && typeof document.activeElement.selectionStart === "number" ? [document.activeElement.selectionStart, document.activeElement.selectionEnd] : null;
     main.replaceChildren(...[nodes].flat(3).filter(Boolean));
     main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
     document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
@@ -265,14 +266,14 @@ function render(moved) {
     (app.after || []).forEach((f) => f());
     app.after = [];
     if (moved) main.focus({ preventScroll: true });
-    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); }
+    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); if (same && caret && same === document.activeElement && typeof same.selectionStart === "number") same.setSelectionRange(...caret); }
     scrollTo(0, where);
   }).catch(fail);
 }
 
 /* Draw the preview; resolves when it is on the screen. */
 async function showPreview(file, data) {
-  if (!app.upload || app.view !== "load" || app.state.files.length) return;
+  if (!app.upload || app.view !== "load" || !app.state || app.state.files.length) return;
   app.preview = { file: file.name, data };
   render(false);
   const frame = () => new Promise((go) => requestAnimationFrame(go));
@@ -283,7 +284,9 @@ async function upload(files) {
   clearError();
   const list = [...files].sort((a, b) => b.name.endsWith(".toml") - a.name.endsWith(".toml"));
   await app.acted; /* a session that is being opened is the one they are for */
+  const id = app.id;
   for (const file of list) {
+    if (app.id !== id) break; /* another one was opened meanwhile: these are not for it */
     if (file.size > app.config.max_upload) { fail(new Error(`${file.name}: ${Math.round(file.size / 1e6)} MB is over the limit of ${Math.round(app.config.max_upload / 1e6)} MB; cut it, save it as NPZ, or start with: irj app FILE`)); continue; }
     app.upload = { text: `sending ${file.name}`, share: 0 };
     surround();
@@ -302,7 +305,7 @@ async function upload(files) {
   app.preview = null;
   surround(); /* the bar goes at once, also where the server does not answer any more */
   await refresh().catch(fail);
-  if (had && !app.state.files.length) render(false);
+  if (had && app.id === id && app.state && !app.state.files.length) render(false);
 }
 
 function theme(name) {
@@ -317,8 +320,9 @@ function remembered(key, value) {
 }
 
 async function enter(id) {
-  const was = { id: app.id, state: app.state, drafts: app.drafts };
-  app.id = id; app.state = null; app.drafts = {};
+  const was = { id: app.id, state: app.state, drafts: app.drafts, draftsOf: app.draftsOf };
+  app.id = id; app.state = null;
+  if (app.draftsOf !== id) Object.assign(app, { drafts: {}, draftsOf: id }); /* one that comes back is edited on */
   try { [app.state, app.config] = await Promise.all([get(""), call("GET", "/api/config")]); } catch (error) { /* the session that was open stays */
     Object.assign(app, was);
     throw error.gone ? new Error("the server here has no such session; see Sessions for those that it keeps") : error;

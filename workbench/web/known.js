@@ -61,17 +61,53 @@ function keepTyped(form, typed) {
   }
 }
 
+/* What is edited on the Model page: on which text it began, what was typed, which known parameters were added. It stays until it is saved or given up, also where the joint becomes another one meanwhile. */
+function jointDraft(text) {
+  const draft = app.drafts.joint;
+  if (draft && (draft.text === text || draft.saving || draft.added.length || Object.keys(draft.typed).some((key) => key !== "known-pick"))) return draft;
+  return (app.drafts.joint = { text, typed: {}, added: [], saving: false });
+}
+
+/* Another tab, another page or a joint file changed the joint while it was edited here: nothing is saved over it, and nothing typed goes, until it is said which counts. */
+function movedJoint(draft, text) {
+  const taken = (drop) => { if (drop) delete app.drafts.joint; else draft.text = text; clearError(); render(false); };
+  return h("section", { class: "note", id: "joint-moved", role: "status" },
+    h("p", {}, h("strong", {}, "The joint was changed elsewhere"), " since you began to edit it: in another tab, on another page or by a joint file. What you typed still stands below and is not saved."),
+    h("details", {}, h("summary", {}, "The joint as it is now"), h("pre", { tabindex: "0", "aria-label": "The joint as it is now" }, text)),
+    h("div", { class: "row" }, button("Take the joint as it is now", () => taken(true), { work: false, id: "joint-take" }), button("Keep editing", () => taken(false), { work: false, id: "joint-keep" })),
+    h("p", { class: "small soft" }, "joint-text" in draft.typed ? "Where you keep editing and save, your joint file replaces that one as a whole." : "Where you keep editing and save, your fields replace those of that joint; the others stay as they are now."));
+}
+
+/* Save the joint, or nothing; what was typed while the answer was under way stays. The server refuses it where the joint is not the one any more that was edited. */
+async function saveJoint(draft, body) {
+  if (!body) { await refresh(); return; }
+  const sent = { ...draft.typed };
+  draft.saving = true;
+  try {
+    const made = await post("/joint", { ...body, was: draft.text });
+    draft.text = made.text; draft.added.length = 0;
+    for (const key of Object.keys(sent)) if (draft.typed[key] === sent[key]) delete draft.typed[key];
+  } finally {
+    draft.saving = false;
+    await refresh();
+    if (app.view === "model") render(false); /* it may have been drawn before the answer came */
+  }
+}
+
 /* Under an effect that needs a known parameter: its fields, and the fit with it. The model as it stands is fitted again on a branch of its own. */
 function knownAsk(item, rows) {
   const asked = item.asks.map((name) => rows.find((r) => r.name === name)).filter(Boolean), prefix = `ask-${item.effect}`;
   if (!asked.length) return null;
-  const host = h("div", {}, knownRow(asked[0], prefix, ["value", "unit", "side"]));
+  const drafts = app.drafts.asked || (app.drafts.asked = {}), typed = drafts[item.effect] || (drafts[item.effect] = {});
+  const host = h("div", {}, knownRow(asked.find((r) => r.name === typed[`${prefix}-which`]) || asked[0], prefix, ["value", "unit", "side"]));
   const which = asked.length < 2 ? null : h("select", { id: `${prefix}-which`, "aria-label": `Which is known, for ${item.title}`, onchange: (e) => host.replaceChildren(knownRow(asked.find((r) => r.name === e.target.value), prefix, ["value", "unit", "side"])) }, asked.map((r) => h("option", { value: r.name }, words(r.name))));
   const give = () => {
-    const typed = knownAll(host), [[name, entry]] = Object.entries(typed);
+    const given = knownAll(host), [[name, entry]] = Object.entries(given);
     const { problem } = typedNumber(entry.value, words(name), null, null);
     if (problem) { fail(new Error(problem)); $(`${prefix}-${name}-value`).focus(); return; }
-    act(async () => { await post("/joint", { hold: typed, source: app.state.joint_source || "joint" }); await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
+    act(async () => { await post("/joint", { hold: given, source: app.state.joint_source || "joint" }); delete drafts[item.effect]; await refresh(); }).then((done) => { if (done) run("fit", {}, "diagnose"); });
   };
-  return h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
+  const node = h("div", { class: "asked" }, which, host, button("Give it and fit again", give, { id: `${prefix}-give`, label: `Give it and fit again, for ${item.title}` }));
+  keepTyped(node, typed);
+  return node;
 }

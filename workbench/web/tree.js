@@ -24,15 +24,15 @@ function treeCard(state) {
   const draft = app.drafts.tree || (app.drafts.tree = { chosen: [], noting: null });
   const body = h("div", { class: "tree" }), card = h("section", { class: "card", id: "tree", "aria-label": "Tree of fits" }, h("h2", {}, "Tree of fits"), h("p", { class: "small soft" }, "Every fit is kept. A changed record or joint begins a branch; nothing is deleted."), body);
   const go = (branch, step) => act(async () => { await post("/tree", { open: branch, step }); await refresh(); });
-  const write = (of, change) => act(async () => { draft.noting = null; await post("/tree", { of, ...change }); await refresh(); });
+  const write = (of, change) => act(async () => { await post("/tree", { of, ...change }); draft.noting = draft.note = null; await refresh(); render(false); /* it may have been drawn before the answer came */ });
   const draw = (branches) => {
     const node = (n) => {
-      const s = n.step, id = `fit-${s.id}`, noting = draft.noting === s.id;
+      const s = n.step, id = `fit-${s.id}`, noting = draft.noting === s.id, note = { name: s.remark.name || "", text: s.remark.note || "", ...(noting ? draft.note : null) };
       const tick = h("input", { type: "checkbox", id: `${id}-compare`, "aria-label": `Compare ${stepTitle(s)}, ${digits(s.error)} %`, checked: draft.chosen.includes(s.id), onchange: (e) => { draft.chosen = [...draft.chosen.filter((x) => x !== s.id), ...(e.target.checked ? [s.id] : [])].slice(-2); draw(branches); } });
       return h("li", {}, h("div", { class: `fit${n.now ? " now" : n.on ? " on" : ""}`, id }, tick, h("span", { class: "fit-name" }, stepTitle(s)), h("span", { class: "num" }, `${digits(s.error)} %`), s.diagnosed ? h("span", { class: "tag good" }, "diagnosed") : null,
         n.now ? h("span", { class: "tag" }, "now") : button("Open", () => go(n.branch.id, s.id), { kind: "quiet", id: `${id}-open`, label: `Open ${stepTitle(s)}, ${digits(s.error)} %` }),
-        button(s.remark.note || s.remark.name ? "Edit note" : "Name, note", () => { draft.noting = noting ? null : s.id; draw(branches); }, { kind: "quiet", work: false, id: `${id}-note`, label: `${s.remark.note || s.remark.name ? "Edit note" : "Name, note"} of ${stepTitle(s)}` })),
-        noting ? h("form", { class: "row", onsubmit: (e) => { e.preventDefault(); write(s.id, { name: $(`${id}-name`).value, note: $(`${id}-text`).value }); } }, h("input", { id: `${id}-name`, "aria-label": "Name", placeholder: "Name", value: s.remark.name || "" }), h("input", { id: `${id}-text`, size: "48", "aria-label": "Note", placeholder: "Note", value: s.remark.note || "" }), h("button", { type: "submit" }, "Keep")) : s.remark.note ? h("p", { class: "small soft note-text" }, s.remark.note) : null,
+        button(s.remark.note || s.remark.name ? "Edit note" : "Name, note", () => { draft.noting = noting ? null : s.id; draft.note = null; draw(branches); }, { kind: "quiet", work: false, id: `${id}-note`, label: `${s.remark.note || s.remark.name ? "Edit note" : "Name, note"} of ${stepTitle(s)}` })),
+        noting ? h("form", { class: "row", oninput: () => { draft.note = { name: $(`${id}-name`).value, text: $(`${id}-text`).value }; }, onsubmit: (e) => { e.preventDefault(); write(s.id, { name: $(`${id}-name`).value, note: $(`${id}-text`).value }); } }, h("input", { id: `${id}-name`, "aria-label": "Name", placeholder: "Name", value: note.name }), h("input", { id: `${id}-text`, size: "48", "aria-label": "Note", placeholder: "Note", value: note.text }), h("button", { type: "submit" }, "Keep")) : s.remark.note ? h("p", { class: "small soft note-text" }, s.remark.note) : null,
         n.children.length ? h("ul", {}, n.children.map(node)) : null);
     };
     const groups = treeOf(branches).map((g) => h("div", { class: "input" }, h("p", { class: "small" }, h("strong", {}, g.change || "First input"), h("span", { class: "soft" }, ` · ${g.input || "no record"}`)),

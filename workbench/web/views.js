@@ -60,9 +60,10 @@ const views = {
       torque_per_current: $("torque_per_current").value, torque_per_voltage: $("torque_per_voltage").value, model: $("model").value,
       effects: [...document.querySelectorAll("[name=effect]:checked")].map((c) => c.value), known: knownAll(node),
     });
-    const draft = app.drafts.joint && app.drafts.joint.text === text ? app.drafts.joint : (app.drafts.joint = { text, typed: {}, added: [] });
+    const draft = jointDraft(text), moved = draft.text !== text && !draft.saving;
+    const unfolded = others.some((e) => chosen.has(e.key) || `effect=${e.key}` in draft.typed);
     let edited = !text || Object.keys(draft.typed).some((key) => key !== "joint-text");
-    const save = async () => { if ($("joint-text").value !== text) await post("/joint", { text: $("joint-text").value, source: state.joint_source || "joint" }); else if (edited) await post("/joint", read()); };
+    const save = () => saveJoint(draft, $("joint-text").value !== text ? { text: $("joint-text").value, source: state.joint_source || "joint" } : edited ? read() : null);
     const node = h("form", { oninput: (e) => { if (e.target.id !== "joint-text") edited = true; }, onsubmit: (e) => e.preventDefault() },
       h("div", { class: "two" }, h("div", { class: "card" }, h("h2", {}, "The joint"),
         field("name", "Name", form.name || "joint", "As it appears in the report."),
@@ -74,15 +75,15 @@ const views = {
           field("torque_per_voltage", side(form.kind).torque_per_voltage, form.torque_per_voltage, "Where only a voltage or a controller output is recorded.", { inputmode: "decimal" }))),
       h("div", { class: "card" }, h("h2", {}, "The start model"), h("div", { class: "field" }, h("label", { for: "model" }, "Model"), select, h("span", { class: "small soft" }, "Start simple: the diagnosis says what is missing.")),
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
-          h("details", { open: others.some((e) => chosen.has(e.key)) }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
-        h("details", {}, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
+          h("details", { open: unfolded }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
+        h("details", { open: "joint-text" in draft.typed }, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
       knownCard(known, draft.added),
-      h("div", { class: "row" }, button("Save and fit", () => act(async () => { await save(); await refresh(); }).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
-        button("Save", () => act(async () => { await save(); await refresh(); }), { id: "save" })));
+      h("div", { class: "row" }, button("Save and fit", () => act(save).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
+        button("Save", () => act(save), { id: "save" })));
     keepTyped(node, draft.typed);
     const kind = node.querySelector("[name=kind]:checked").value;
     later(() => relabel(kind));
-    return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), node];
+    return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), moved ? movedJoint(draft, text) : null, node];
   },
 
   async compare(state) {

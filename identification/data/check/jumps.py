@@ -78,9 +78,9 @@ def _off(values: FloatArray) -> FloatArray:
 
 
 def _slip(record: Record, channel: str) -> tuple[int, float, int] | None:
-    excess = np.zeros(len(record))
+    excess, values = np.zeros(len(record)), _numbers(record[channel])
     for part in record.segments():
-        excess[part.start + 1 : part.stop] = _off(np.diff(record[channel][part]))
+        excess[part.start + 1 : part.stop] = _off(np.diff(values[part]))
     excess = np.nan_to_num(excess)
     usual = float(np.quantile(excess, 0.999))
     limit = max(
@@ -90,12 +90,17 @@ def _slip(record: Record, channel: str) -> tuple[int, float, int] | None:
 
 
 def _spike(record: Record, channel: str) -> tuple[int, float, int] | None:
-    values = record[channel]
+    values = _numbers(record[channel])
     off = np.zeros(len(record))
     for part in record.segments():
         off[part] = _off(values[part])
     low, high = np.nanquantile(values, [0.001, 0.999])
     return _worst(np.nan_to_num(off), max(_SPIKE * float(high - low), 1e-300))
+
+
+def _numbers(values: FloatArray) -> FloatArray:
+    """Values with what is no number as a hole, which other checks speak of."""
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _worst(size: FloatArray, limit: float) -> tuple[int, float, int] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv as _csv
 import re
 from collections import Counter
@@ -28,6 +29,10 @@ scripts in the header.
 """
 _HEAD_BYTES: Final = 1 << 17
 _HEAD_LINES: Final = 100
+MOST_COLUMNS: Final = 10_000
+"""Columns of a text file: ten times those of the largest logs; more are the samples of a table that
+lies on its side.
+"""
 _CLOCK: Final = re.compile(r"\d{4}-\d\d?-\d\d?|\d\d?:\d\d|\d\d?[./]\d\d?[./]\d{2,4}")
 _MISSING: Final = frozenset({"", "nan", "na", "n/a", "null", "none", "-nan", "#n/a"})
 _NUMBER: Final = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?\s*$")
@@ -110,15 +115,20 @@ def _decode(path: Path) -> tuple[str, list[str], bool]:
         )
     else:
         encoding = "utf-8-sig"
-    cut = head if whole else head[: head.rfind(b"\n") + 1] or head
     try:
-        text = cut.decode(encoding)
+        text = _text_of(head, encoding, whole=whole)
     except UnicodeDecodeError:
         encoding = "latin-1"
-        text = cut.decode(encoding)
+        text = _text_of(head, encoding, whole=whole)
     if not text.strip():
         raise InputError(f"{path}: is empty: record again or give another file")
     return encoding, text.splitlines(), whole
+
+
+def _text_of(head: bytes, encoding: str, *, whole: bool) -> str:
+    """The whole lines of a file's head, which may end in the middle of a letter."""
+    text = codecs.getincrementaldecoder(encoding)().decode(head, final=whole)
+    return text if whole else text[: text.rfind("\n") + 1] or text
 
 
 def _wide(head: bytes) -> str | None:
@@ -191,6 +201,11 @@ def _layout(path: Path) -> _Layout:
         )
     number, line = body[first]
     cells = _cells(line, delimiter)
+    if len(cells) > MOST_COLUMNS:
+        raise InputError(
+            f"{path}: has more than {MOST_COLUMNS} columns; a record has a row for each sample: "
+            "exchange rows and columns, or leave columns out"
+        )
     comma = delimiter != "," and _decimal_comma(lines[number:], delimiter, path)
     names, units, used = _header([text for _, text in body[:first]], delimiter, len(cells), path)
     notes: list[str] = []

@@ -198,3 +198,16 @@ def test_a_row_beside_a_gap_is_not_bridged_over_it() -> None:
 @pytest.mark.parametrize("unit", ["U/min", "1/min", "min^-1", "Upm"])
 def test_revolutions_per_minute_have_german_names_too(unit: str) -> None:
     assert base_unit(unit) == base_unit("rpm")
+
+
+@pytest.mark.parametrize("channel", ["link_torque", "link_position"])
+def test_an_infinite_sample_is_a_hole_and_no_jump(channel: str) -> None:
+    """It was off by 1.8e308 of its unit, beside being no number."""
+
+    def put(a: dict[str, Array]) -> None:
+        a[channel] = a[channel].copy()
+        a[channel][50] = np.inf
+
+    findings = check(record(put), RATIO)
+    assert [f for f in findings if f.code == "jump"] == []
+    assert any("not a number" in f.message and f.channel == channel for f in findings)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,36 @@ def test_encodings(tmp_path: Path, encoding: str, unit: str) -> None:
             )
         )
     )
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
+def test_encodings_of_a_file_longer_than_its_head(tmp_path: Path, encoding: str, ends: str) -> None:
+    """What is looked at ends in the middle of a line, or of a letter: what Excel calls "Unicode
+    text" was no table.
+    """
+    t = 0.002 * np.arange(20_000)
+    table = np.column_stack([t, np.sin(t), np.rad2deg(np.cos(t))])
+    content = text("time_s,motor_current_A,link_position [deg]", table).replace("\n", ends)
+    record = read(write(tmp_path / "run.txt", content, encoding))
+    assert record.time == pytest.approx(t, abs=1e-9)
+    assert record.channels["link_position"] == pytest.approx(np.cos(t), abs=1e-9)
+
+
+def test_a_table_that_lies_on_its_side(tmp_path: Path) -> None:
+    """Its samples would be columns without end; it took hours to say so."""
+    path = write(tmp_path / "run.csv", "1," * 200_000)
+    with pytest.raises(InputError, match="exchange rows and columns"):
+        read(path)
+
+
+def test_many_columns_are_guessed_at_once(tmp_path: Path) -> None:
+    """Ten thousand names that count on: as many steps as names, not the square of that."""
+    path = write(tmp_path / "run.csv", "1," * 9_999 + "1\n")
+    begin = time.perf_counter()
+    with pytest.raises(InputError, match=r"\(10000 in all\)"):
+        read(path)
+    assert time.perf_counter() - begin < 10.0
 
 
 def test_path_with_spaces_and_umlauts(tmp_path: Path) -> None:

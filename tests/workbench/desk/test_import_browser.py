@@ -73,3 +73,43 @@ def test_headers_that_say_everything_are_doubted_on_the_card_of_the_record(
     assert expected in said
     if case == "joints side by side":
         assert page.input_value("select[aria-label='Joint']") == "1"
+
+
+@pytest.mark.parametrize("name", ["Prüfstand (2) – Lauf №1, 50 % #a&b.csv", "关节 1号 it's.csv"])
+def test_a_name_stands_on_the_page_as_it_is(page: Any, name: str, tmp_path: Path) -> None:
+    """On its card and in the list of records; and it can be taken out by it."""
+    columns, _ = NAMED["a supply"]
+    path = written(tmp_path, **columns).rename(tmp_path / name)
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.set_input_files("#files", [path])
+    page.wait_for_function("() => app.state && app.state.files.length === 1 && !busy()")
+    assert page.locator("main h2", has_text=name).count() == 1
+    assert page.inner_text("#series-file option") == name
+    page.get_by_role("button", name=f"Remove {name}", exact=True).click()
+    page.wait_for_function("() => app.state && app.state.files.length === 0 && !busy()")
+
+
+def test_files_are_not_for_a_session_that_is_opened_while_they_are_sent(
+    page: Any, tmp_path: Path
+) -> None:
+    """The second of two files went into the new session, or left the page busy for ever."""
+    columns, _ = NAMED["a supply"]
+    first = written(tmp_path, **columns).rename(tmp_path / "first.csv")
+    second = tmp_path / "second.csv"
+    second.write_bytes(first.read_bytes())
+    page.click("#fresh")
+    page.wait_for_function("() => app.state && !busy()")
+    old, held = page.evaluate("app.id"), []
+    page.route("**/files/first.csv*", lambda route: held.append(route))
+    page.set_input_files("#files", [first, second])
+    while not held:
+        page.wait_for_timeout(20)
+    page.click("#fresh")
+    page.wait_for_function("id => app.id !== id && app.state", arg=old)
+    held[0].continue_()
+    page.wait_for_function("() => !busy()")
+    page.unroute("**/files/first.csv*")
+    assert page.evaluate("get('').then((s) => s.files.length)") == 0
+    there = page.evaluate("id => call('GET', `/api/session/${id}`)", old)
+    assert [f["name"] for f in there["files"]] == ["first.csv"]

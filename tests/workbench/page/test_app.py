@@ -5,6 +5,7 @@ numbers of the library.
 from __future__ import annotations
 
 import gzip
+import html
 import http.client
 import io
 import json
@@ -16,10 +17,12 @@ import subprocess
 import sys
 import threading
 import time
+import unicodedata
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -28,13 +31,14 @@ pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
 from identification.errors import InputError
+from identification.scratch import part_of
 from tests.workbench.served import Server, serving
 from workbench.page.demo import demo_files
-from workbench.page.desk import home, sources
+from workbench.page.desk import home
 from workbench.page.records import decimated, guessed_role, thinned
 from workbench.page.security import CSP
 from workbench.page.server import _listen, with_files
-from workbench.page.session import Session, State, Store, safe_name, write_atomic
+from workbench.page.session import Session, State, Store, safe_name, stored_as, write_atomic
 from workbench.page.uploads import check_unpacked
 
 LIMIT = 8_000_000
@@ -263,11 +267,84 @@ def test_session_identifiers_cannot_be_guessed_or_listed(client: Client, root: P
         (".hidden", "hidden"),
         ("", "record"),
         ("a\x00b.csv", "a_b.csv"),
-        ("ü.csv", "_.csv"),
+        ("Prüfstand (2) – Lauf №1, 50 %.csv", "Prüfstand (2) – Lauf №1, 50 %.csv"),
+        ("测试/关节 1号.csv", "关节 1号.csv"),
+        ("u\u0308ber.csv", "über.csv"),
+        ("نمونه\u200cها.csv", "نمونه\u200cها.csv"),
+        ("axis\u202evsc.exe", "axis_vsc.exe"),
+        ("a\u200bb.csv", "a_b.csv"),
+        ("\udce9.csv", "_.csv"),
+        ("what?.csv", "what_.csv"),
+        ("C:run.csv", "C_run.csv"),
+        ("aux.csv", "_aux.csv"),
+        ("Com1", "_Com1"),
+        ("console.csv", "console.csv"),
+        ("\u3000 ... ", "record"),
+        ("x.csv. ", "x.csv"),
     ],
 )
 def test_names_of_uploads_are_made_safe(given: str, safe: str) -> None:
     assert safe_name(given) == safe
+
+
+@pytest.mark.parametrize("letter", ["a", "ü", "测", "🦾"])
+@pytest.mark.parametrize("ending", [".csv", ".csv.gz", ".no-ending-is-as-long-as-this"])
+def test_names_too_long_for_a_file_system_are_cut_between_letters(
+    letter: str, ending: str, tmp_path: Path
+) -> None:
+    """The file system takes it with what is put before it, also while it comes."""
+    made = safe_name(100 * letter + 200 * "b" + ending)
+    assert made.startswith(10 * letter)
+    assert made.endswith(ending) == (len(ending) < 20)
+    assert set(made) <= {letter, *"b", *ending}
+    (tmp_path / stored_as(made)).touch()
+    part_of(tmp_path / stored_as(made)).touch()
+
+
+def test_a_name_that_the_file_system_cannot_write_is_stored_under_another_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "fsencode", lambda name: name.encode("latin-1"))
+    assert stored_as("über.csv").endswith("-über.csv")
+    assert stored_as("关节.csv").endswith("-__.csv")
+
+
+def test_names_in_any_script_stay_through_page_report_and_exports(
+    client: Client, root: Path, tmp_path: Path
+) -> None:
+    """Also where the same letters come spelled in another way."""
+    where = client.session()
+    files = {n: c for n, c in demo_files().items() if n.endswith(".npz")}
+    train, held = (next(c for n, c in files.items() if w in n) for w in ("train", "held"))
+    joint = demo_files()["joint.toml"].decode().replace('name = "', 'name = "Gelenk Ä ', 1)
+    names = ("Prüfstand 关节.npz", "held über #1 50%.npz")
+    assert client.upload(where, quote("Gelenk ä.toml"), joint.encode())[0] == 200
+    assert client.upload(where, quote(unicodedata.normalize("NFD", names[0])), train)[0] == 200
+    assert client.upload(where, quote(names[1]), held)[0] == 200
+    client.run(where, "fit")
+    assert [f["name"] for f in client.get(where)["files"]] == list(names)
+    stored = sorted(p.name.partition("-")[2] for p in (root / where[-32:] / "files").iterdir())
+    assert stored == sorted(names)
+    client.run(where, "report")
+    headers, report = client.raw("GET", f"{where}/view/report.html")[1:]
+    assert all(html.escape(n) in report.decode() for n in names)
+    assert quote("Gelenk_Ä") in headers["content-disposition"]
+    fitted = client.raw("GET", f"{where}/view/joint.toml")[2].decode()
+    assert Path(names[0]).stem in fitted
+
+    for name, content in zip(names, (train, held), strict=True):
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "session.py").write_bytes(client.raw("GET", f"{where}/view/session.py")[2])
+    done = subprocess.run(
+        [sys.executable, "session.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+    )
+    assert done.returncode == 0, done.stderr
+    assert Path(names[0]).stem in (tmp_path / "fitted.toml").read_text(encoding="utf-8")
 
 
 # --- uploads --------------------------------------------------------------------------------------
@@ -742,6 +819,11 @@ def test_files_of_the_command_line_are_in_the_session(tmp_path: Path) -> None:
     assert state.joint_text == JOINT
     with pytest.raises(InputError, match="there is no such file"):
         with_files(tmp_path / "sessions", ["missing.csv"])
+    (tmp_path / "empty.csv").touch()
+    with pytest.raises(InputError, match=r"empty.csv: is empty \(0 bytes\)"):
+        with_files(tmp_path / "sessions", [tmp_path / "train.npz", tmp_path / "empty.csv"])
+    left = [p.name for p in (tmp_path / "sessions").iterdir()]
+    assert left == [identifier], "what could not be opened leaves no session"
 
 
 # --- parts ----------------------------------------------------------------------------------------
@@ -889,7 +971,10 @@ def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) 
         with server.full_disk():
             status, said = client.post("/api/session")
             assert status == 507
-            assert said.startswith("File too large; check the path")
+            assert "state.json: File too large; check the path" in said
+            status, _, said = client.raw("PUT", f"{where}/files/a.csv", b"time_s,motor_current_A")
+            assert status == 507
+            assert b"a.csv: File too large; check the path" in said
             assert {p.name for p in tmp_path.iterdir()} == before
             key = {"X-IRJ-Home": home.key_of(Store(tmp_path))}
             assert client.raw("GET", "/api/home", headers=key)[0] == 200
@@ -898,14 +983,44 @@ def test_a_full_disk_lets_the_page_open_and_says_what_cannot_be(tmp_path: Path) 
         server.kill()
 
 
-def test_nothing_is_written_where_nothing_may_be_followed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The server starts on a disk that takes no more."""
-    sources.allow(tmp_path, [tmp_path / "live.csv"])
-    monkeypatch.setattr(sources, "write_atomic", None)
-    sources.allow(tmp_path, [])
-    assert sources.allowed(tmp_path) == []
+def test_each_of_two_servers_offers_what_it_was_started_with(tmp_path: Path) -> None:
+    """They serve the same sessions; neither takes or gets what the other one may follow."""
+    mine, theirs, root = tmp_path / "mine.csv", tmp_path / "theirs.csv", tmp_path / "sessions"
+    stream = "udp://127.0.0.1:9870"
+    with (
+        serving(root, follow=[mine, stream]) as first,
+        serving(root, follow=[theirs]) as second,
+        serving(root) as third,
+    ):
+        clients = [Client(s.port) for s in (first, second, third)]
+        given = [[str(mine), stream], [str(theirs)], []]
+        sessions = [client.session() for client in clients]
+        for client, where, own in zip(clients, sessions, given, strict=True):
+            assert client.get(f"{where}/view/replay")["sources"] == own
+            for other in {str(mine), str(theirs), stream, "/etc/passwd"} - set(own):
+                status, said = client.post(f"{where}/run", {"action": "follow", "source": other})
+                assert (status, "was not named when the page was started" in said) == (422, True)
+        status, said = clients[1].post(
+            f"{sessions[1]}/run", {"action": "follow", "source": str(theirs)}
+        )
+        assert status == 202, said
+        assert clients[1].wait(sessions[1])["error"].startswith("follow: fit first")
+    assert not list(root.glob("*.json")), "what a server may follow is not kept in the folder"
+
+
+def test_what_was_followed_goes_on_only_where_the_next_server_may(tmp_path: Path) -> None:
+    """A server that was killed while it followed: its session is opened by one without the file."""
+    from workbench.page import verbs
+    from workbench.page.live import Live
+
+    path = str(tmp_path / "live.csv")
+    session = Store(tmp_path / "sessions").create()
+    session.begin({"action": "follow", "source": path})
+    live = Live(session)
+    verbs.resume(live)
+    assert live.job is None
+    assert "was not named when the page was started" in str(live.snapshot()["error"])
+    live.close()
 
 
 def test_a_quota_that_is_no_number_is_one_sentence(

@@ -59,10 +59,7 @@ def stream() -> str:
 @pytest.fixture(scope="module")
 def page(root: Path, growing: Path, stream: str) -> Iterator[Any]:
     """The demo with what it lacks, fitted."""
-    from workbench.page.desk.sources import allow
-
-    allow(root, [growing, stream])
-    with serving(root) as there, launched() as chromium:
+    with serving(root, follow=[growing, stream]) as there, launched() as chromium:
         made = context_of(chromium, viewport={"width": 1280, "height": 860}).new_page()
         fit_demo(made, there.address)
         idle(made, "compare")

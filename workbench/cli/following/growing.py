@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import tempfile
 import time
@@ -41,6 +42,8 @@ LOOKS: Final = 400
 """Looks at the course that are kept at least; twice as many are thinned to every other one."""
 LOOK: Final = 0.05
 """Time between two looks before any is thinned out [s]."""
+_LINE: Final = re.compile(r"\bline (\d+)")
+"""Where a reader says that something is."""
 
 
 class Source(Protocol):
@@ -69,6 +72,7 @@ class Growing:
         self.path, self.joint, self.name = path, joint, str(path)
         self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
         self._head, self._at = b"", 0
+        self._row, self._lines = b"", 0
 
     def __enter__(self) -> Self:
         return self
@@ -102,15 +106,21 @@ class Growing:
         if not whole or (not self._at and whole.count(b"\n") < FIRST_ROWS):
             return None
         part = self._folder / "part.csv"
-        part.write_bytes(self._head + whole)
+        before = self._head + 2 * self._row  # two rows alike, by which a table is known
+        part.write_bytes(before + whole)
         try:
             if not self._at:
                 self._head = b"".join(whole.splitlines(keepends=True)[: head_of(part)])
             made = read(part, columns=self.joint.columns, kind=self.joint.kind, name=self.path.stem)
         except InputError as error:
-            raise InputError(str(error).replace(str(part), str(self.path))) from None
-        self._at += len(whole)
-        return made
+            said = str(error).replace(str(part), str(self.path))
+            earlier = self._lines - before.count(b"\n")
+            raise InputError(_LINE.sub(lambda m: f"line {int(m[1]) + earlier}", said)) from None
+        again = 2 if self._row else 0
+        rows = (x for x in reversed(whole.splitlines(keepends=True)) if _is_row(x))
+        self._row = next(rows, self._row)
+        self._at, self._lines = self._at + len(whole), self._lines + whole.count(b"\n")
+        return made.take(np.arange(len(made)) >= again) if len(made) > again else None
 
 
 def follow(
@@ -168,6 +178,10 @@ def follow(
             f"{source.name}: fewer than {FIRST_ROWS} lines came {when}; start the recording "
             "first, or follow it for longer"
         )
+
+
+def _is_row(line: bytes) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith((b"#", b"%", b"//"))
 
 
 @final

@@ -18,6 +18,7 @@ from typing import Any, Final, final
 
 from casadi_models import EFFECTS
 from identification.errors import InputError
+from identification.scratch import deaf_children
 from workbench.page.analysis import Progress
 from workbench.page.jobs.child import STOP, Ask, Done, Refused, Said, main
 from workbench.page.work import CancelledError
@@ -177,7 +178,8 @@ class Helper:
                 target=main, args=(there, self.folder, EFFECTS.files), daemon=True, name="session"
             )
             try:
-                process.start()
+                with deaf_children():
+                    process.start()
             except (OSError, EOFError) as error:  # EOFError: what starts processes has ended
                 why = getattr(error, "strerror", None) or "the system ended what starts it"
                 raise InputError(
@@ -225,7 +227,8 @@ def warm_up() -> None:
     """Start the process that the others are copies of, before the first work needs it."""
     process = _context().Process(target=os.getpid, daemon=True, name="warm up")
     with contextlib.suppress(OSError, EOFError, RuntimeError):  # the server ends just then
-        process.start()
+        with deaf_children():
+            process.start()
         process.join()
 
 
