@@ -124,7 +124,7 @@ def judged(
         if len(part)
     )
     alone = tuple(int(np.argmin(aside + _on(part, squares, rows, price))) for part in records)
-    return Judged(best, error, score, behind, chosen, windows, most, alone)
+    return Judged(best, error, score, behind, chosen, windows, most=most, records=alone)
 
 
 def _on(blocks: IntArray, squares: FloatArray, rows: FloatArray, price: FloatArray) -> FloatArray:
