@@ -291,13 +291,13 @@ def test_front_holds_what_no_variant_with_as_few_parameters_beats() -> None:
 def test_a_tie_is_close_or_uncertain_and_never_another_tie_with_more_parts() -> None:
     score = np.array([1.0, 1.04, 1.3, 1.3, 1.02, 0.9])
     behind = np.array([0.0, 0.01, -0.1, 0.2, -0.1, -0.3])
-    scores = Judged(0, score - 1.0, score, behind, np.zeros(6), (), np.ones(6))
+    scores = Judged(0, score - 1.0, score, behind, np.zeros(6), (), most=np.ones(6))
     parts = [frozenset(p) for p in ("a", "b", "c", "d", "ae", "")]
     whole = [True] * 5 + [False]  # the last lacks an effect of the joint's own model
     assert tied_with_best(scores, whole, parts) == [True, True, True, False, False, False]
     # one with parameters fewer whose error is 13 % higher: only its price makes it look alike
     error = score - np.array([1.0, 0.9, 1.0, 1.0, 1.0, 1.0])
-    cheaper = Judged(0, error, score, behind, np.zeros(6), (), np.ones(6))
+    cheaper = Judged(0, error, score, behind, np.zeros(6), (), most=np.ones(6))
     assert tied_with_best(cheaper, whole, parts) == [True, False, True, False, False, False]
     # whole fits leave d for the place of a: its price is no reason to prefer a
     sets = {"a": frozenset("ad")}
@@ -310,7 +310,7 @@ def test_what_only_the_price_holds_back_is_a_tie() -> None:
     error = np.array([0.0, -0.094, -0.03, -0.08, -0.1, -0.16, -0.17, -0.09])
     score = error + price
     most = np.array([0.0, -0.08, -0.02, 0.01, -0.08, -0.1, -0.1, -0.08])
-    scores = Judged(0, error, score, score - score[0], np.zeros(8), (), most)
+    scores = Judged(0, error, score, score - score[0], np.zeros(8), (), most=most)
     parts = [frozenset(p) for p in ("a", "ab", "ac", "ad", "abe", "abf", "ag", "ah")]
     # c is too small, d is not certain, e brings hardly anything beside b; f does, and g alone; h
     # does no more than b, with more parameters
