@@ -166,9 +166,9 @@ class Contest:
         names = self.data.sensing.balances
         entitled = _entitled(self.rivals, data)
         self._taking = {b: taking_part(b, data.train) for b in names}
-        self._drift = [_drift(rival, data) for rival in self.rivals]
+        self._drift = _drift(self.rivals, data)
         left = [
-            {b: self._apart(k, b, r, entitled[k][b]) for b, r in _left(rival, data).items()}
+            {b: self._apart(b, r, entitled[k][b]) for b, r in _left(rival, data).items()}
             for k, rival in enumerate(self.rivals)
         ]
         unlikely = [_unlikely(rival, data) for rival in self.rivals]
@@ -184,11 +184,11 @@ class Contest:
         own = entitled[best]
         self._old = [
             self._rows(
-                k,
+                rival,
                 data,
                 {b: w * weight[b] / own[b] for b, w in self.leader.solution.weights.items()},
             )
-            for k, weight in enumerate(entitled)
+            for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
 
     def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
@@ -202,12 +202,12 @@ class Contest:
             for b, taking in self._taking.items()
         ]
 
-    def _apart(self, k: int, balance: str, rows: FloatArray, weight: FloatArray) -> FloatArray:
+    def _apart(self, balance: str, rows: FloatArray, weight: FloatArray) -> FloatArray:
         """Rows of a balance, (rows,) or (rows, p), of a rival over their scatter: where a measured
         torque drifts, each beside what those before it say of that. A slow law takes a part of one
         course of a drift, and that would count as often as it has rows.
         """
-        drift = self._drift[k].get(balance)
+        drift = self._drift.get(balance)
         if drift is None:
             return rows * (weight if rows.ndim == 1 else weight[:, None])
         scatter = np.divide(1.0, weight, out=np.full(len(weight), np.inf), where=weight > 0)
@@ -216,17 +216,16 @@ class Contest:
         return innovations(rows, scatter, drift, memory=memory, records=records)
 
     def _rows(
-        self, k: int, data: Dataset, weights: Mapping[str, FloatArray]
+        self, rival: Rival, data: Dataset, weights: Mapping[str, FloatArray]
     ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int64]]:
         """Weighted residual, Jacobian over free parameters and unknowns of the runs, block of each
         row."""
-        rival = self.rivals[k]
         form = form_of(rival.solution, data, self.free(rival), weights)
         x = np.array([form.values[n] for n in form.free])
         stacked = form.stacked(x)
         names = form.balances.balances
-        r = np.concatenate([self._apart(k, b, stacked.residual[b], weights[b]) for b in names])
-        j = np.concatenate([self._apart(k, b, stacked.jacobian[b], weights[b]) for b in names])
+        r = np.concatenate([self._apart(b, stacked.residual[b], weights[b]) for b in names])
+        j = np.concatenate([self._apart(b, stacked.jacobian[b], weights[b]) for b in names])
         block = np.concatenate([np.where(stacked.taking[b], stacked.block, -1) for b in names])
         return r, j, block
 
@@ -392,13 +391,15 @@ def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatA
     return levels
 
 
-def _drift(rival: Rival, data: Dataset) -> dict[str, FloatArray]:
-    """What the drift of the measured torques gives each row of a balance of a rival, by balance;
-    none where none drifts.
+def _drift(rivals: Sequence[Rival], data: Dataset) -> dict[str, FloatArray]:
+    """What the drift of the measured torques gives each row of a balance, by balance; none where
+    none drifts. The readings are the same for all rivals: what the one leaves that leaves the least
+    holds a drift for all others, which cannot have lost to it what they lack.
     """
     if not drift_memory(data):
         return {}
-    return noise_rows(rival.solution.model, data, rival.solution.values, data.train)[1]
+    every = [noise_rows(r.solution.model, data, r.solution.values, data.train)[1] for r in rivals]
+    return {b: min((x[b] for x in every), key=rms) for b in every[0]}
 
 
 def _left(rival: Rival, data: Dataset) -> Mapping[str, FloatArray]:
