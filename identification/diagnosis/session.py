@@ -1005,7 +1005,7 @@ class Session:
         for kernel in {c.kernel for c in claims if c.kernel is not None}:
             slower = (self.bench.slower(factor) for factor in SLOWER)
             bench = next(b for b in slower if b is not None and b.data.kernel == kernel)
-            slow = bench.fitted(now.solution.model, now.solution.values, again=True)
+            slow = bench.fitted(now.solution.model, now.solution.values)
             there = bench.held_against(claims, bench.step(None, None, slow))
             shown = {c.label for c in claims if c.kernel == kernel}
             held = {k: e for k, e in held.items() if k not in shown}

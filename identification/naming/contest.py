@@ -17,6 +17,7 @@ from identification.balance.calibration import usual
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
+    LEAST_DEVIATION,
     TURN_WIDTHS,
     apart_from_drift,
     drawn_floors,
@@ -42,8 +43,6 @@ FEWEST: Final = 3.0
 """Log-likelihood from which a name counts as better: odds of twenty to one [nats]."""
 VALLEY_STEPS: Final = 5
 """Gauss-Newton steps from each point of a grid, to see which valley is the deepest."""
-LEAST_VARIANCE: Final = 1e-24
-"""Of a row without noise [N.m squared]: what rounding leaves of torques of 1 N.m."""
 CONTRADICTED: Final = 0.9
 """Share of what the surest rival leaves of its level of noise under which what another one leaves
 contradicts its own: rows and noise are the same for all, so that levels that read too high do so
@@ -363,7 +362,7 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
         )
         for weight, level, way in zip(out, levels, either, strict=True):
             variance = level[b] ** 2 + beside + way[b] ** 2
-            weight[b] = support / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
+            weight[b] = support / np.sqrt(np.maximum(variance, LEAST_DEVIATION**2))
     return out
 
 

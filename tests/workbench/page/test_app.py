@@ -45,6 +45,21 @@ LIMIT = 8_000_000
 JOINT = demo_files()["joint.toml"].decode()
 
 
+def printed(folder: Path, code: str) -> str:
+    """What the code that a page gives prints, run in a folder by a process of its own."""
+    (folder / "session.py").write_text(code, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "session.py"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 class Client:
     """A plain HTTP client: it can also send what a browser would not."""
 
@@ -334,16 +349,7 @@ def test_names_in_any_script_stay_through_page_report_and_exports(
 
     for name, content in zip(names, (train, held), strict=True):
         (tmp_path / name).write_bytes(content)
-    (tmp_path / "session.py").write_bytes(client.raw("GET", f"{where}/view/session.py")[2])
-    done = subprocess.run(
-        [sys.executable, "session.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},
-    )
-    assert done.returncode == 0, done.stderr
+    printed(tmp_path, client.raw("GET", f"{where}/view/session.py")[2].decode())
     assert Path(names[0]).stem in (tmp_path / "fitted.toml").read_text(encoding="utf-8")
 
 
@@ -572,18 +578,8 @@ def test_copied_code_gives_the_same_errors(client: Client, fitted: str, tmp_path
     state = client.get(fitted)
     for name, content in demo_files().items():
         (tmp_path / name).write_bytes(content)
-    (tmp_path / "session.py").write_text(client.get(f"{fitted}/view/code")["code"])
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    done = subprocess.run(
-        [sys.executable, "session.py"],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    said = [float(line.split()[-1]) for line in done.stdout.splitlines()]
+    told = printed(tmp_path, client.get(f"{fitted}/view/code")["code"])
+    said = [float(line.split()[-1]) for line in told.splitlines()]
     assert said == pytest.approx(
         [s["held_out"]["relative_error_percent"] for s in state["steps"]], rel=2e-3
     )
