@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal, final
+from typing import Final, Literal, final
 
 from .quantities import linear_unit
 
@@ -26,6 +26,12 @@ Role = Literal[
     "order",
     "range",
 ]
+WRONG_SCALE: Final = 20.0
+"""Most by which a scale of torques can be wrong: the check of the records refuses a larger factor
+between drive and link torque."""
+WRONG_RATIO: Final = 2.0
+"""The same of one position against the other: the check refuses positions whose ratio is a few
+percent off the gear ratio, and what torsion adds to that is less than the motion."""
 Typical = float | Mapping[str, float] | None
 """A usual size, or one for each place, or none."""
 
@@ -135,14 +141,21 @@ def signed(
     unit: str,
     meaning: str,
     *,
+    low: float = -math.inf,
+    high: float = math.inf,
     role: Role = "",
     typical: Typical = None,
     added: bool = False,
 ) -> Parameter:
     """An amplitude that may have either sign."""
-    return Parameter(
-        name, unit, 0.0, -math.inf, math.inf, meaning, role=role, typical=typical, added=added
-    )
+    return Parameter(name, unit, 0.0, low, high, meaning, role=role, typical=typical, added=added)
+
+
+def scale_error(name: str, meaning: str, most: float, *, typical: Typical = None) -> Parameter:
+    """The relative error of a scale, by a factor of at most `most` either way: a scale has a sign,
+    and 1 + error is not zero.
+    """
+    return signed(name, "1", meaning, low=1 / most - 1, high=most - 1, typical=typical)
 
 
 def shape(

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from ..effect import effect
-from ..parameter import signed
+from ..parameter import WRONG_RATIO, scale_error
 from ..signals import Expression, LocalSignals, gain_error
 
 
@@ -13,10 +13,10 @@ from ..signals import Expression, LocalSignals, gain_error
     family="sensor",
     acts_on=("link_position_sensor",),
     parameters=(
-        signed(
+        scale_error(
             "link_position_gain",
-            "1",
             "relative error: link reading = (1 + error) motor reading / gear_ratio, no torsion",
+            WRONG_RATIO,
             typical=0.002,
         ),
     ),

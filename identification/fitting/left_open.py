@@ -6,6 +6,10 @@ With noise of unit variance in the rows, and the parameters known as the trainin
 the squared length of a residual r in its covariance I + J P J' is the least of
 |r + J d|^2 + |R d|^2 over the steps d of the parameters, R'R = P^-1 (Kalman's update of a value by
 what comes later; the innovations of Mehra 1970). Steps stay inside the bounds of the parameters.
+
+Zeros and clocks of the other records are their own and were fitted to them at the values of the
+fit; they move along: a gap that no training row crosses is open by as much as the zero of an
+encoder that its flank stands for. What the other balances of these records lose by it is paid.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, names_of_runs
+from identification.balance.calibration import bare, limits_of_runs, names_of_runs
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import floor_rows, row_weights, stack
 from identification.balance.weak import WeakRecord
@@ -131,50 +135,74 @@ class LeftOpen:
         weights : mapping of str to (rows,) array
             1/deviation of each row by noise.
         """
-        balances = balances_of(self.solution.model, data.sensing, wrt=self.names)
+        model = self.solution.model
+        runs = names_of_runs(model, records)
+        every = (*runs, *self.names)
+        balances = balances_of(model, data.sensing, wrt=bare(every))
+        of_runs = limits_of_runs(model, records)
+        limits = tuple(
+            np.concatenate([[of_runs[n][i] for n in runs], side])
+            for i, side in enumerate(self.limits)
+        )
+        logarithmic = np.concatenate([np.zeros(len(runs), dtype=bool), self.logarithmic])
+        start = np.array([values[n] for n in every])
+        columns = stack(balances, records, values, every).jacobian
         out = {}
         for b, weight in ((b, w) for b, w in weights.items() if b in self.asked):
-            problem = _Beside(self, balances, records, values, b, weight)
+            others = [columns[o] * w[:, None] for o, w in weights.items() if o != b]
+            lost = self._lost(len(runs), np.concatenate(others) if others else None)
+            problem = _Beside(every, start, lost, balances, records, values, b, weight)
             found = least_squares(
                 problem,
-                problem.start,
-                self.limits,
-                logarithmic=self.logarithmic,
+                start,
+                (limits[0], limits[1]),
+                logarithmic=logarithmic,
                 iterations=ITERATIONS,
                 tolerance=ENOUGH,
             ).x
-            step = found - problem.start
-            each = np.linalg.norm(problem.jacobian(found)[: len(weight)] * step, axis=0)
+            step = found - start
+            moved = problem.jacobian(found)[: len(weight)] * step
+            each = np.linalg.norm(moved[:, len(runs) :], axis=0)
             leading = each > LEADING * each.max(initial=0.0)
             out[b] = Step(
-                problem.left(found) - problem.left(problem.start),
-                float(np.sum((self.triangle @ step) ** 2)),
+                problem.left(found) - problem.left(start),
+                float(np.sum((lost @ step) ** 2)),
                 tuple(n for n, x in zip(self.names, leading, strict=True) if x),
             )
         return out
+
+    def _lost(self, runs: int, others: FloatArray | None) -> FloatArray:
+        """What a step loses elsewhere: that of the runs in the other balances of their records,
+        that of the rest in the training rows.
+        """
+        count = len(self.names)
+        own = np.zeros((runs, runs)) if others is None else triangle_of(others[:, :runs])
+        return np.block(
+            [
+                [own, np.zeros((len(own), count))],
+                [np.zeros((len(self.triangle), runs)), self.triangle],
+            ]
+        )
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """Rows of one balance of other records, and what the training rows lose; a
+    """Rows of one balance of other records, and what is lost elsewhere; a
     :class:`identification.fitting.least_squares.Problem`.
     """
 
-    known: LeftOpen
+    names: tuple[str, ...]
+    start: FloatArray
+    lost: FloatArray
     balances: Balances
     records: Sequence[WeakRecord]
     values: Mapping[str, float]
     balance: str
     weight: FloatArray
 
-    @cached_property
-    def start(self) -> FloatArray:
-        """Values of the fit, (p,)."""
-        return np.array([self.values[n] for n in self.known.names])
-
     def _at(self, x: FloatArray) -> Mapping[str, float]:
-        return {**self.values, **dict(zip(self.known.names, x.tolist(), strict=True))}
+        return {**self.values, **dict(zip(self.names, x.tolist(), strict=True))}
 
     @cached_property
     def _bare(self) -> Balances:
@@ -185,15 +213,14 @@ class _Beside:
         return np.asarray(stack(self._bare, self.records, self._at(x)).residual[self.balance])
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted rows, and those of the training records, (rows + p,)."""
-        lost = self.known.triangle @ (x - self.start)
-        return np.concatenate([self.left(x) * self.weight, lost])
+        """Weighted rows, and what is lost elsewhere, (rows + p,)."""
+        return np.concatenate([self.left(x) * self.weight, self.lost @ (x - self.start)])
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative, (rows + p, p)."""
-        found = stack(self.balances, self.records, self._at(x), self.known.names)
+        found = stack(self.balances, self.records, self._at(x), self.names)
         columns = found.jacobian[self.balance] * self.weight[:, None]
-        return np.concatenate([columns, self.known.triangle])
+        return np.concatenate([columns, self.lost])
 
 
 __all__ = ["LeftOpen", "Step"]

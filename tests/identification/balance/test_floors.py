@@ -188,6 +188,29 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
 
 
+def test_rows_that_noise_leaves_open_refuse_nothing() -> None:
+    """Where a turn falls between two samples the noise allows a row nearly anything: what happens
+    there is not weighed against a fall in all others.
+    """
+    turns = np.arange(400) % 20 == 0
+
+    def error(size: float, at_turns: float) -> Error:
+        residual = np.where(turns, at_turns, size)
+        weight = np.where(turns, 0.01, 1.0)
+        weighted = rms(residual * weight) / rms(weight)
+        return Error(
+            float(np.linalg.norm(residual)),
+            0.0,
+            0.0,
+            {"motor": BalanceError(weighted, 0.1, weighted / 0.1, "N.m", residual, weight)},
+        )
+
+    before, after = error(0.5, 10.0), error(0.3, 10.5)
+    assert after.relative_error_percent > 1.02 * before.relative_error_percent
+    assert made_worse(before, after) == ""
+    assert made_worse(error(0.5, 10.0), error(0.52, 9.0)).startswith("the held-out error rises")
+
+
 @pytest.mark.parametrize("speed", [0.002, 0.02, 0.2])
 @pytest.mark.parametrize("beside", [0.0, 0.2])
 def test_what_the_steps_of_an_encoder_take_off_a_slow_motion_is_drawn(

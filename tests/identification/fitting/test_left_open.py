@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from identification import Joint
+from identification import Joint, load_joint, read
 from identification.balance.calibration import settled
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.fitting.assess import assess
 from identification.fitting.engine import solve
+from identification.fitting.first_fit import first_fit
 from identification.fitting.left_open import LeftOpen
 from tests.identification.diagnosis.test_session import at_one_speed
+from tests.recorded_world.world import make_case, write_case
 from tests.smooth_laws import nothing, record
 
 JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb", "quadratic_drag"))
@@ -66,3 +70,27 @@ def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
     # rows overlap: windows of time tell the errors, and rows that are taken as independent less
     assert np.all((stated / errors)[np.isfinite(stated)] > 0.7)
     assert np.all((stated / errors)[np.isfinite(stated)] < 5)
+
+
+def test_a_gap_that_no_training_row_crosses_moves_with_the_zero_of_its_flank(
+    tmp_path: Path,
+) -> None:
+    """On one flank a gap is a zero of the link's encoder, so nothing tells its size, and records
+    that cross it stand far over the noise until both may move.
+    """
+    case = make_case(240002, kind="none")  # backlash, listed three times too wide
+    folder = write_case(case, tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    model = prepared_model(joint, train)
+    data = load_dataset([train], [held], joint, model)
+    found = first_fit(model, data)
+    values = settled(found.model, data.sensing, [*data.train, *data.held_out], found.values)
+    given = LeftOpen.of(found, data, values, frozenset({"transmission"}))
+    plain, beside = (
+        assess(found.model, data, data.held_out, found.values, x).balances["transmission"]
+        for x in (None, given)
+    )
+    assert plain.ratio > 10
+    assert beside.ratio < 1.3
+    assert beside.left_open == ("backlash",)
