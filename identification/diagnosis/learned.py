@@ -396,12 +396,14 @@ def _own(group: Sequence[Claim], place: str, balance: str) -> Callable[[Candidat
 
 
 def variable_of(effect: Effect) -> str:
-    """The variable over which a law is a curve; empty where it is none of one variable."""
+    """The variable over which a law is a curve; empty where it is none of one variable: friction
+    that changes with temperature follows no curve over velocity.
+    """
     if effect.memory is not None:
         return ""
-    own = {t.over for t in _tables() if t.over in effect.reads}
-    if len(own) == 1:
-        return own.pop()
+    read = effect.reads - {"direction"}
+    if len(read) == 1 and read <= {t.over for t in _tables()}:
+        return next(iter(read))
     return "velocity" if effect.reads == {"direction"} else ""
 
 

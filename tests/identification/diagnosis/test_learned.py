@@ -23,6 +23,7 @@ from smooth_laws import (
     settling,
 )
 
+from casadi_models import EFFECTS
 from identification.data.joint_file import Joint, load_joint
 from identification.data.read import read
 from identification.diagnosis.candidates import Candidate
@@ -37,6 +38,7 @@ from identification.diagnosis.learned import (
     equivalence,
     equivalences,
     learned_claims,
+    variable_of,
     with_curves,
 )
 from identification.diagnosis.trials import make_base
@@ -264,6 +266,21 @@ def test_the_loop_leaves_a_true_name_plain(key: str) -> None:
     found = asked(38, NAMES[key])
     assert [(c.effects, c.like) for c in found.claims] == [((key,), "")]
     assert found.verdict == "complete"
+
+
+@pytest.mark.parametrize(
+    ("key", "over"),
+    [
+        ("quadratic_drag", "velocity"),
+        ("stribeck", "velocity"),
+        ("cyclic_friction", "position"),
+        ("load_dependent_friction", "load"),
+        ("thermal_friction", ""),  # of velocity and temperature: no curve over velocity says it
+        ("lugre", ""),
+    ],
+)
+def test_a_law_is_held_against_the_curve_of_its_one_variable(key: str, over: str) -> None:
+    assert variable_of(EFFECTS[key]) == over
 
 
 def test_a_spring_rests_where_it_rests() -> None:
