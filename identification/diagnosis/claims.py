@@ -277,6 +277,28 @@ def unproved(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Tria
     ][:LARGEST_SET]
 
 
+def outvoted(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:
+    """The best trials that are certain and lower what they leave of their balance by enough, and
+    that another balance is against.
+
+    Where the encoders are coarse, inertias without the missing law stand where they pass little
+    noise on. A trial counts what leaves this place as a loss; the whole fit with the law, noise
+    taken off, may find more noise there and no more of anything else.
+    """
+    sure = FALSE_DISCOVERY / max(len(ranking.everything), 1)
+    return [
+        t
+        for t in ranking.everything
+        if t.candidate.label not in refused
+        and t.p_value <= sure
+        and t.gain <= GAIN
+        and t.effect.stage != "late"
+        and not t.effect.is_delay
+        and t.beyond_noise(t.cv_drop_percent) >= least_drop(t, base)
+        and t.beyond_noise(t.held_out_drop_percent) >= HELD_OUT_DROP
+    ][:LARGEST_SET]
+
+
 def least_drop(trial: Trial, base: Base) -> float:
     """Fall of the RMS that a claim of this name must bring [%]."""
     if trial.effect.common:
