@@ -871,11 +871,31 @@ class Session:
             if len(made.claims) == len(standing.claims):
                 if claim.label in odds.behind:
                     self._refused[claim.label] = odds.behind[claim.label]
-                standing, stale = made, True
+                standing, stale = self._still_needed(made, position), True
         if stale:
             base = self.bench.base(standing.now.solution)
             ranking = self.bench.ranking(base)
         return _with_hints(standing), ranking, base
+
+    def _still_needed(self, standing: _Standing, position: int) -> _Standing:
+        """The steps without the claims behind this one that were made beside another name in its
+        place, and that the trials do not show beside this one.
+        """
+        title = standing.claims[position].effect.title
+        for claim in standing.claims[position + 1 :]:
+            others = tuple(c for c in standing.claims if c is not claim)
+            if (
+                claim.kernel is not None
+                or claim.effect.stage == "structure"
+                or any(claim.effects[0] in c.effect.needs for c in others)
+            ):
+                continue
+            base, ranking = self._lacking(claim, standing)
+            ranking = self._confirmed(ranking, base, self.bench.step(None, None, base.solution))
+            if claim.label not in ranking.significant:
+                self._refused[claim.label] = f"is not needed with {title} in the model"
+                standing = self._replay(others, standing)
+        return standing
 
     def _told_apart(self, new: Claim, trial: Trial, standing: _Standing) -> _Standing | None:
         """A name of an earlier set that asks to be added beside it: where it alone does better,
