@@ -433,7 +433,7 @@ def test_a_name_that_takes_the_gear_for_the_motor_is_not_what_is_missing(tmp_pat
     still more than its noise. What is left at its noise wins, though no trial showed it: with
     inertias that pass little noise on, the other balance was against it.
     """
-    folder = write_case(make_case(245003, kind="triple"), tmp_path, "encoders")
+    folder = write_case(make_case(245003, kind="triple", size=1.0), tmp_path, "encoders")
     joint = load_joint(folder / "joint.toml")
     train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
     found = improve(train, joint, [held])
