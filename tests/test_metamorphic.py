@@ -96,6 +96,16 @@ def test_the_same_is_named(name: str, result: Result, tmp_path: Path) -> None:
     assert found.sets == result.sets
 
 
+@pytest.mark.parametrize("name", ["two runs each", "two files each"])
+def test_a_drift_is_told_by_every_run_of_a_file(name: str, tmp_path: Path) -> None:
+    """Over 10 s of three records the drive drifts; the longest run of each alone did not tell."""
+    case = case_of("kuka_axis1")
+    other = TRANSFORMS[name][1](case)
+    assert other is not None
+    begun, found = result_of(told(case, tmp_path)), result_of(told(other, tmp_path))
+    assert (found.verdict, found.sets) == (begun.verdict, begun.sets) == ("nothing_missing", ())
+
+
 def test_a_run_given_twice_is_refused(base: Told) -> None:
     with pytest.raises(InputError, match="holds the same samples"):
         improve([*base.train, base.train[0]], base.joint, base.held)
