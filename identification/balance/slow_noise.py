@@ -143,12 +143,12 @@ def _calm(rest: FloatArray) -> FloatArray:
 
 
 def _walks(record: WeakRecord, rests: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Variance by which each torque's reading certainly walks in a second, by signal."""
-    stretches = _telling(record)
-    found = {
-        key: _together([_walk(rest[rows], length) for rows, length in stretches])
-        for key, rest in rests.items()
-    }
+    """Variance by which each torque's reading certainly walks in a second, by signal: over the
+    longest stretch alone. Before any model every run holds what a curve leaves of its friction, and
+    sixteen runs of a pendulum bench together were sure of a drift that was none.
+    """
+    rows, length = _longest(record)
+    found = {key: _walk(rest[rows], length) for key, rest in rests.items()}
     return _agreed({key: walk for key, walk in found.items() if walk is not None})
 
 
