@@ -22,9 +22,9 @@ from identification.data.record import Record
 
 FloatArray = npt.NDArray[np.float64]
 
-EVEN: Final = 1e-3
-"""Spread of the steps, as a share of the median one, below which stamps count as even: that of
-stamps written with few digits.
+EVEN: Final = 0.02
+"""Range of the steps, as a share of the period, up to which stamps count as even: the balances'
+kernels do not see it. What a motion does between such stamps is noise of the rows.
 """
 
 

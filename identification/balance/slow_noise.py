@@ -143,7 +143,10 @@ def _calm(rest: FloatArray) -> FloatArray:
 
 
 def _walks(record: WeakRecord, rests: Mapping[str, FloatArray]) -> dict[str, float]:
-    """Variance by which each torque's reading certainly walks in a second, by signal."""
+    """Variance by which each torque's reading certainly walks in a second, by signal: over the
+    longest stretch alone. Before any model every run holds what a curve leaves of its friction, and
+    sixteen runs of a pendulum bench together were sure of a drift that was none.
+    """
     rows, length = _longest(record)
     found = {key: _walk(rest[rows], length) for key, rest in rests.items()}
     return _agreed({key: walk for key, walk in found.items() if walk is not None})
@@ -245,10 +248,24 @@ def _agreed(walks: Mapping[str, _Walk]) -> dict[str, float]:
 
 def _longest(record: WeakRecord) -> tuple[npt.NDArray[np.bool_], float]:
     """Rows of the longest stretch, and its length [s]."""
+    return max(_stretches(record), key=lambda s: s[1])
+
+
+def _stretches(record: WeakRecord) -> list[tuple[npt.NDArray[np.bool_], float]]:
+    """Rows of each stretch, and its length [s]."""
     stretch = record.stretch
     number = np.bincount(stretch) if len(stretch) else np.zeros(1, dtype=np.int64)
-    rows = stretch == int(np.argmax(number))
-    return rows, float(number.max()) * record.grid.stride * record.grid.dt
+    step = record.grid.stride * record.grid.dt
+    return [(stretch == k, float(n) * step) for k, n in enumerate(number)]
+
+
+def _telling(record: WeakRecord) -> list[tuple[npt.NDArray[np.bool_], float]]:
+    """Stretches in which a walk is looked for: all that are long enough for it, so that runs of one
+    file tell what they tell as files; the longest in any case.
+    """
+    longest = _longest(record)[1]
+    enough = min(longest, 2 ** (OCTAVES - 1) / HIGHEST)
+    return [(rows, length) for rows, length in _stretches(record) if length >= enough]
 
 
 @final
@@ -307,6 +324,19 @@ def _walk(course: FloatArray, length: float) -> _Walk | None:
     return _Walk(rate, flat - walking, walking, len(number) - 2)
 
 
+def _together(walks: Sequence[_Walk | None]) -> _Walk | None:
+    """What several courses say of one walk; None where none of them can say anything."""
+    told = [x for x in walks if x is not None]
+    if not told:
+        return None
+    return _Walk(
+        float(np.mean([x.rate for x in told])),
+        sum(x.fall for x in told),
+        sum(x.left for x in told),
+        sum(x.degrees for x in told),
+    )
+
+
 def drift_of_rest(
     records: Sequence[WeakRecord], rests: Mapping[str, Sequence[FloatArray]]
 ) -> dict[str, Part]:
@@ -330,46 +360,48 @@ def drift_of_rest(
     found = {}
     for key, courses in rests.items():
         walks = [
-            _walk(_calm(rest), _longest(w)[1])
-            for w, rest in zip(records, _beside_laws(records, key, courses), strict=True)
+            _together([_walk(_calm(rest), length) for rest, length in rests])
+            for rests in _beside_laws(records, key, courses)
         ]
-        told = [x for x in walks if x is not None]
-        if len(told) < len(walks):
+        whole = None if None in walks else _together(walks)
+        if whole is None:
             return {}
-        found[key] = _Walk(
-            float(np.mean([x.rate for x in told])),
-            sum(x.fall for x in told),
-            sum(x.left for x in told),
-            sum(x.degrees for x in told),
-        )
+        found[key] = whole
     memory = max(_longest(w)[1] for w in records) / 3.0
     return {c: _drift(rate, memory) for c, rate in _agreed(found).items()}
 
 
 def _beside_laws(
     records: Sequence[WeakRecord], key: str, courses: Sequence[FloatArray]
-) -> list[FloatArray]:
-    """What is left of the longest stretch of each record beside a mean of its own and free curves
-    of speed and place that all have in common: a law is the same in every record, a drift is not,
-    and over the few speeds of a sweep a curve of its own would follow it.
+) -> list[list[tuple[FloatArray, float]]]:
+    """What is left of the stretches of each record, with their lengths [s], beside a mean of its
+    own in each and free curves of speed and place that all have in common: a law is the same in
+    every record, a drift is not, and over the few speeds of a sweep a curve of its own would follow
+    it.
     """
+    stretches = [_telling(w) for w in records]
     kept = [
-        _longest(w)[0] & np.isfinite(course) for w, course in zip(records, courses, strict=True)
+        np.any([rows for rows, _ in own], axis=0) & np.isfinite(course)
+        for own, course in zip(stretches, courses, strict=True)
     ]
-    ends = np.cumsum([np.count_nonzero(k) for k in kept])
-    if not ends[-1]:
-        return [course[k] for course, k in zip(courses, kept, strict=True)]
+    inside = [[rows[k] for rows, _ in own] for own, k in zip(stretches, kept, strict=True)]
+    values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
+    if not len(values):
+        return [[(values, length) for _, length in own] for own in stretches]
     sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.points for w in records)]
     side = sides[-1] if key == "torque" else sides[0]
-    number = np.repeat(np.arange(len(records)), [np.count_nonzero(k) for k in kept])
-    columns = [np.equal.outer(number, np.arange(len(records))).astype(np.float64)]
+    columns = [block_diag(*(np.stack(own, axis=1).astype(np.float64) for own in inside))]
     curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
     columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
     warming = [_warming(w, side, k) for w, k in zip(records, kept, strict=True)]
     if all(warming):
         columns.append(block_diag(*(parts[0] for parts in warming)))
-    values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
-    return np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
+    ends = np.cumsum([np.count_nonzero(k) for k in kept])
+    left = np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
+    return [
+        [(rest[rows], length) for rows, (_, length) in zip(places, own, strict=True)]
+        for rest, places, own in zip(left, inside, stretches, strict=True)
+    ]
 
 
 def _drift(rate: float, memory: float) -> Part:

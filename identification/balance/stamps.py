@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.noise import noise_level
+from identification.balance.noise import EVEN, noise_level
 from identification.balance.weak import CLAIM_KERNEL, KERNEL_SAMPLES
 from identification.data.check.quanta import quantum
 
@@ -26,10 +26,6 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
-EVEN: Final = 0.02
-"""Range of the steps, as a share of the period, up to which a record counts as even: the
-balances' kernels do not see it.
-"""
 CLEAR: Final = 0.3
 """Length of the mean phasor of the stamps from which their slots are told: jitter of a quarter
 of a period has 0.29.

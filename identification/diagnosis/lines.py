@@ -26,8 +26,8 @@ from identification.balance.calibration import settled, values_on
 from identification.balance.clocks import shifted
 from identification.balance.dataset import Dataset, run_name
 from identification.balance.kinematic import residual_unit
+from identification.balance.noise import EVEN
 from identification.balance.sensing import Sensing, signals_of
-from identification.balance.stamps import EVEN
 from identification.balance.weak import POSITION_CHAINS, Grid, WeakRecord, kernel, whole
 from identification.data.check.quanta import quantum
 from identification.data.joint_file import Joint

@@ -14,9 +14,8 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.solve import runge_kutta
-from identification.balance.noise import noise_level
+from identification.balance.noise import EVEN, noise_level
 from identification.balance.sensing import Sensing, signals_of
-from identification.balance.stamps import EVEN
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError

@@ -15,8 +15,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.noise import EVEN
 from identification.balance.sensing import DRIVES, drive_torque
-from identification.balance.stamps import EVEN
 from identification.data.channels import CHANNELS, channel_unit
 from identification.data.joint_file import Joint
 from identification.data.prepare import decimate

@@ -11,8 +11,8 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.noise import EVEN
 from identification.balance.sensing import Sensing, signals_of
-from identification.balance.stamps import EVEN
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 

@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from casadi_models import JointModel
+from casadi_models.functions import JointFunctions
 from casadi_models.simulate import Trajectory, sampled_step, simulate
 
 FloatArray = npt.NDArray[np.float64]
@@ -240,3 +241,26 @@ def test_a_late_link_encoder_reads_what_was_true_a_moment_before() -> None:
     assert read[2] == pytest.approx(true[2] - late * rates[2], abs=1e-12)
     assert read[3] == pytest.approx(true[3] - late * rates[3], abs=1e-12)
     assert np.array_equal(np.delete(read, [2, 3]), np.delete(true, [2, 3]))
+
+
+@pytest.mark.parametrize("kind", ["hd1", "hd3"], ids=["rigid", "elastic"])
+def test_a_torque_from_elsewhere_turns_the_link_its_own_way(kind: str) -> None:
+    """By Newton: over the link's inertia, or over all of it where the joint is rigid."""
+    plain = JointModel.harmonic_drive(kind)
+    values = {n: MASSES.get(n, 0.0) for n in plain.parameter_names}
+    functions = JointFunctions(plain, open_to_disturbances=True)
+    state = np.zeros(4 if plain.is_elastic else 2)
+
+    def rates(push: list[float]) -> FloatArray:
+        given = [values[n] for n in plain.parameter_names]
+        return np.array(functions.disturbed(state, [0.0, 0.0, 0.0], given, push)[0]).ravel()
+
+    pushed = rates([0.0, 7.0]) - rates([0.0, 0.0])
+    if plain.is_elastic:
+        assert pushed == pytest.approx([0.0, 0.0, 0.0, 7.0 / MASSES["link_inertia"]])
+        twisted = rates([7.0, 0.0]) - rates([0.0, 0.0])
+        against = [0.0, -7.0 / MASSES["motor_inertia"], 0.0, 7.0 / MASSES["link_inertia"]]
+        assert twisted == pytest.approx(against)
+    else:
+        whole = sum(v for n, v in values.items() if n.endswith("inertia"))
+        assert pushed == pytest.approx([0.0, 7.0 / whole])

@@ -114,6 +114,33 @@ def test_a_growing_file_gives_what_the_whole_record_gives(joint_file: Path, tmp_
         assert standing(then.verdicts).startswith("Link position at 9")
 
 
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "mark, utf-16-be"]
+)
+def test_a_file_of_wide_characters_grows_as_any(
+    encoding: str, joint_file: Path, tmp_path: Path
+) -> None:
+    """As a logger under Windows writes it; it is looked at within a line and within a letter."""
+    joint, path = load_joint(joint_file), tmp_path / "live.csv"
+    mark, _, encoding = encoding.rpartition(", ")
+    text = "\n".join(lines(faulty=False)[:2001]) + "\n"
+    whole = (("\ufeff" if mark else "") + text).encode(encoding)
+    ends = sorted({*range(9_001, len(whole), 30_011), len(whole)})
+    assert {end % 2 for end in ends[:-1]} == {0, 1}
+    rows = []
+    with Growing(path, joint) as source:
+        for end in ends:
+            path.write_bytes(whole[:end])
+            if (part := source.new()) is not None:
+                rows.append(part)
+    assert len(rows) > 3
+    record = read(path, joint=joint)
+    np.testing.assert_array_equal(np.concatenate([r.time for r in rows]), record.time)
+    for channel in record.channels:
+        found = np.concatenate([r[channel] for r in rows])
+        np.testing.assert_array_equal(found, record[channel], err_msg=channel)
+
+
 def test_a_long_recording_is_thinned_and_no_peak_is_lost(
     joint_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -241,7 +241,18 @@ function showStep() {
 }
 
 /* Where the focus is: by id, else by its place among the elements of its kind. */
-function placeOf(node, main) { return { id: node.id, tag: node.tagName, place: [...main.querySelectorAll(node.tagName)].indexOf(node) }; }
+function placeOf(node, root) { return { id: node.id, tag: node.tagName, place: [...root.querySelectorAll(node.tagName)].indexOf(node) }; }
+
+/* Draw something anew: the focus stays on the same control and the caret in its place; where the view is another one, it has the focus. */
+function keepingFocus(root, draw, moved) {
+  const node = document.activeElement, focused = !moved && root.contains(node) ? placeOf(node, root) : null;
+  const caret = focused && typeof node.selectionStart === "number" ? [node.selectionStart, node.selectionEnd] : null;
+  draw();
+  const same = moved ? root : focused && (focused.id ? $(focused.id) : root.querySelectorAll(focused.tag)[focused.place]);
+  if (!same) return;
+  same.focus({ preventScroll: true });
+  if (caret && same === document.activeElement && typeof same.selectionStart === "number") same.setSelectionRange(...caret);
+}
 
 /* Whether the screen shows the view that is open, as the state has it; the list of sessions is asked for again. */
 const drawnNow = (main) => Boolean(app.state) && app.view !== "home" && main.dataset.view === app.view && main.dataset.session === app.id && main.dataset.revision === String(app.state.revision);
@@ -257,16 +268,14 @@ function render(moved) {
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
-    const focused = main.contains(document.activeElement) ? placeOf(document.activeElement, main) : null; /* now, not when the drawing began */
-    const caret = focused && typeof document.activeElement.selectionStart === "number" ? [document.activeElement.selectionStart, document.activeElement.selectionEnd] : null;
-    main.replaceChildren(...[nodes].flat(3).filter(Boolean));
-    main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
-    document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
-    surround();
-    (app.after || []).forEach((f) => f());
-    app.after = [];
-    if (moved) main.focus({ preventScroll: true });
-    else if (focused) { const same = focused.id ? $(focused.id) : main.querySelectorAll(focused.tag)[focused.place]; if (same) same.focus({ preventScroll: true }); if (same && caret && same === document.activeElement && typeof same.selectionStart === "number") same.setSelectionRange(...caret); }
+    keepingFocus(main, () => { /* the focus of now, not of when the drawing began */
+      main.replaceChildren(...[nodes].flat(3).filter(Boolean));
+      main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
+      document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
+      surround();
+      (app.after || []).forEach((f) => f());
+      app.after = [];
+    }, moved);
     scrollTo(0, where);
   }).catch(fail);
 }

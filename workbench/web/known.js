@@ -61,10 +61,13 @@ function keepTyped(form, typed) {
   }
 }
 
+/* The fields of the joint that were typed or chosen and are not saved yet. */
+const fieldsTyped = (draft) => Object.keys(draft.typed).filter((key) => key !== "joint-text" && key !== "known-pick");
+
 /* What is edited on the Model page: on which text it began, what was typed, which known parameters were added. It stays until it is saved or given up, also where the joint becomes another one meanwhile. */
 function jointDraft(text) {
   const draft = app.drafts.joint;
-  if (draft && (draft.text === text || draft.saving || draft.added.length || Object.keys(draft.typed).some((key) => key !== "known-pick"))) return draft;
+  if (draft && (draft.text === text || draft.saving || draft.added.length || "joint-text" in draft.typed || fieldsTyped(draft).length)) return draft;
   return (app.drafts.joint = { text, typed: {}, added: [], saving: false });
 }
 
@@ -76,6 +79,18 @@ function movedJoint(draft, text) {
     h("details", {}, h("summary", {}, "The joint as it is now"), h("pre", { tabindex: "0", "aria-label": "The joint as it is now" }, text)),
     h("div", { class: "row" }, button("Take the joint as it is now", () => taken(true), { work: false, id: "joint-take" }), button("Keep editing", () => taken(false), { work: false, id: "joint-keep" })),
     h("p", { class: "small soft" }, "joint-text" in draft.typed ? "Where you keep editing and save, your joint file replaces that one as a whole." : "Where you keep editing and save, your fields replace those of that joint; the others stay as they are now."));
+}
+
+/* The fields say the whole joint, and so does the joint file: where both were edited only one of them can be saved, and nothing is until it is said which. */
+function bothEdited(draft) {
+  const keep = (text) => {
+    if (text) draft.added.length = 0;
+    for (const key of text ? fieldsTyped(draft) : ["joint-text"]) delete draft.typed[key];
+    clearError(); render(false);
+  };
+  return h("section", { class: "note", id: "joint-both", role: "status", hidden: true },
+    h("p", {}, h("strong", {}, "The fields and the joint file were both edited"), ", and each of them is the whole joint. One of the two is saved; what was edited in the other goes."),
+    h("div", { class: "row" }, button("Keep the fields", () => keep(false), { work: false, id: "both-fields" }), button("Keep the joint file", () => keep(true), { work: false, id: "both-text" })));
 }
 
 /* Save the joint, or nothing; what was typed while the answer was under way stays. The server refuses it where the joint is not the one any more that was edited. */

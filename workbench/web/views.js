@@ -62,8 +62,12 @@ const views = {
     });
     const draft = jointDraft(text), moved = draft.text !== text && !draft.saving;
     const unfolded = others.some((e) => chosen.has(e.key) || `effect=${e.key}` in draft.typed);
-    let edited = !text || Object.keys(draft.typed).some((key) => key !== "joint-text");
-    const save = () => saveJoint(draft, $("joint-text").value !== text ? { text: $("joint-text").value, source: state.joint_source || "joint" } : edited ? read() : null);
+    let edited = !text || fieldsTyped(draft).length > 0;
+    const both = bothEdited(draft), askBoth = () => { both.hidden = !fieldsTyped(draft).length || $("joint-text").value === text; };
+    const save = async () => {
+      if (!both.hidden) throw new Error("the fields and the joint file were both edited; say above the button which of the two is saved");
+      await saveJoint(draft, $("joint-text").value !== text ? { text: $("joint-text").value, source: state.joint_source || "joint" } : edited ? read() : null);
+    };
     const node = h("form", { oninput: (e) => { if (e.target.id !== "joint-text") edited = true; }, onsubmit: (e) => e.preventDefault() },
       h("div", { class: "two" }, h("div", { class: "card" }, h("h2", {}, "The joint"),
         field("name", "Name", form.name || "joint", "As it appears in the report."),
@@ -77,10 +81,12 @@ const views = {
         h("fieldset", {}, h("legend", {}, "Effects in it from the start"), h("div", { class: "checks" }, common.map((k) => box(k, effectTitle(k))), exact.map((k) => box(k, effectTitle(k)))),
           h("details", { open: unfolded }, h("summary", {}, `All others (${others.length})`), h("div", { class: "checks" }, others.map((e) => box(e.key, e.title))))),
         h("details", { open: "joint-text" in draft.typed }, h("summary", {}, "As joint file (TOML), with known values and column map"), h("label", { for: "joint-text" }, "Joint file"), h("textarea", { id: "joint-text", spellcheck: "false", value: text })))),
-      knownCard(known, draft.added),
+      knownCard(known, draft.added), both,
       h("div", { class: "row" }, button("Save and fit", () => act(save).then((done) => { if (done) run("fit", {}, "compare"); }), { kind: "primary", id: "save-fit", off: !state.files.some((f) => ["ready", "checking", "columns"].includes(f.status)) }),
         button("Save", () => act(save), { id: "save" })));
     keepTyped(node, draft.typed);
+    node.addEventListener("input", askBoth);
+    later(askBoth);
     const kind = node.querySelector("[name=kind]:checked").value;
     later(() => relabel(kind));
     return [heading("Model", "What is known about the joint, and the model to start from. Everything else has a start value and bounds derived from the records."), moved ? movedJoint(draft, text) : null, node];
@@ -233,7 +239,7 @@ function fileCard(f) {
   const role = h("select", { id: `role-${f.id}`, "aria-label": `Role of ${f.name}`, onchange: (e) => act(async () => { await post(`/file/${f.id}`, { role: e.target.value }); await refresh(); }) }, [["train", "Fit"], ["held_out", "Held out"]].map(([v, t]) => h("option", { value: v, selected: f.role === v }, t)));
   return h("section", { class: "card", "aria-label": f.name }, h("div", { class: "row between" },
     h("div", {}, h("h2", {}, f.name), shown ? h("p", { class: "soft small" }, `${plural(s.samples, "sample")}, ${digits(s.duration, 4)} s, every ${digits(1000 * s.dt, 3)} ms${s.segments > 1 ? `, ${s.segments} stretches` : ""}. ${f.role_reason.charAt(0).toUpperCase()}${f.role_reason.slice(1)}.`) : null),
-    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`columns-${f.id}`] = !app.drafts[`columns-${f.id}`]; app.drafts[`map-${f.id}`] = { now: true }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
+    h("div", { class: "row" }, shown ? role : null, f.status === "columns" ? null : button("Columns", () => { app.drafts[`columns-${f.id}`] = !app.drafts[`columns-${f.id}`]; app.drafts[`map-${f.id}`] = { request: { now: true }, typed: {} }; render(false); }, { kind: "quiet", work: false, id: `columns-${f.id}`, label: `Columns of ${f.name}` }), button("Remove", () => act(async () => { await call("DELETE", `${base()}/file/${f.id}`); await refresh(); }), { kind: "quiet", label: `Remove ${f.name}` }))),
     f.status === "refused" ? h("p", { class: "bad" }, plainly(f.message)) : null,
     f.status === "checking" ? h("p", { class: "small soft", role: "status" }, "Going through the check gate …") : null,
     f.status === "columns" ? columnMap(f) : null,

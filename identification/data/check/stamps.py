@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from identification.balance.stamps import EVEN, Slots, longest_hole, slots_of
+from identification.balance.noise import EVEN
+from identification.balance.stamps import Slots, longest_hole, slots_of
 from identification.data.check.finding import Finding, at
 
 if TYPE_CHECKING:

@@ -27,6 +27,7 @@ MOSTLY: Final = 0.9
 """Share of the high bytes that are 0 in a table of numbers as UTF-16; the rest are letters of other
 scripts in the header.
 """
+_MARKS: Final = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
 _HEAD_BYTES: Final = 1 << 17
 _HEAD_LINES: Final = 100
 MOST_COLUMNS: Final = 10_000
@@ -102,11 +103,8 @@ def _decode(path: Path) -> tuple[str, list[str], bool]:
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     whole = len(head) < _HEAD_BYTES
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encoding = "utf-16"
-        head = head[: len(head) // 2 * 2]
-    elif wide := _wide(head):
-        encoding = wide
+    if wide := wide_encoding(head):
+        encoding = "utf-16" if head.startswith(tuple(_MARKS)) else wide
         head = head[: len(head) // 2 * 2]
     elif b"\x00" in head:
         raise InputError(
@@ -131,10 +129,12 @@ def _text_of(head: bytes, encoding: str, *, whole: bool) -> str:
     return text if whole else text[: text.rfind("\n") + 1] or text
 
 
-def _wide(head: bytes) -> str | None:
-    """UTF-16 without a mark: of text in a table nearly every other byte is 0, of a binary file
-    hardly.
+def wide_encoding(head: bytes) -> str | None:
+    """Which UTF-16 the first bytes of a text file are: that of its mark; without one, of text in a
+    table nearly every other byte is 0, of a binary file hardly. None where a character is a byte.
     """
+    if marked := _MARKS.get(head[:2]):
+        return marked
     for encoding, high, low in (
         ("utf-16-le", head[1::2], head[::2]),
         ("utf-16-be", head[::2], head[1::2]),

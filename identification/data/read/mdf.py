@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from identification.data.read._table import RATES, Signal, Table, merged, missin
 from identification.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
 
@@ -32,7 +34,7 @@ def open_mdf(path: Path) -> Table:
     except ImportError:
         raise missing_package("asammdf", "mdf", "MDF files", str(path)) from None
     try:
-        with asammdf.MDF(path) as file:
+        with _opened(asammdf, path) as file:
             places, units = _channels(file)
     except MemoryError:
         raise
@@ -62,12 +64,24 @@ def open_mdf(path: Path) -> Table:
     )
 
 
+@contextlib.contextmanager
+def _opened(asammdf: Any, path: Path) -> Iterator[Any]:
+    """The file as asammdf has it. Of one that its logger did not finish it makes a copy, which it
+    leaves where the file cannot be read: that lies in a folder that goes.
+    """
+    with (
+        tempfile.TemporaryDirectory(prefix="irj-", ignore_cleanup_errors=True) as folder,
+        asammdf.MDF(path, temporary_folder=folder) as file,
+    ):
+        yield file
+
+
 def _signals(
     asammdf: Any, path: Path, places: Mapping[str, tuple[int, int]]
 ) -> dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[Any]]]:
     found = {}
     try:
-        with asammdf.MDF(path) as file:
+        with _opened(asammdf, path) as file:
             for name, (group, index) in places.items():
                 signal = file.get(group=group, index=index)
                 found[name] = (

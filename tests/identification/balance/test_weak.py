@@ -170,10 +170,13 @@ def test_steps_of_an_encoder_that_cancel_are_no_velocity(unit: float) -> None:
     assert np.abs(speed).max() > 1.0 * unit
 
 
-def test_blocks_are_even_and_no_row_reaches_over_their_ends() -> None:
-    """Two stretches of 4 s and 2 s in blocks of about 1.5 s: three and one."""
-    time = np.concatenate([np.arange(2000) * 2e-3, 10 + np.arange(1000) * 2e-3])
-    parts = (slice(0, 2000), slice(2000, 3000))
+@pytest.mark.parametrize("count", range(2000, 2048, 4))
+def test_blocks_are_even_and_no_row_reaches_over_their_ends(count: int) -> None:
+    """Two stretches of 4 s and 2 s in blocks of about 1.5 s: three and one. A row lies a few
+    samples from the next: of some lengths one lies so that it would reach over by a single sample.
+    """
+    time = np.concatenate([np.arange(count) * 2e-3, 10 + np.arange(1000) * 2e-3])
+    parts = (slice(0, count), slice(count, count + 1000))
     made = prepare(time, {"motor_position": np.sin(time)}, parts, first_block=5)
     first = made.time < 5
     assert set(made.block[first]) == {-1, 5, 6, 7}

@@ -5,6 +5,8 @@ files.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import time
 import tomllib
@@ -515,6 +517,32 @@ def test_mdf_with_two_rates(tmp_path: Path) -> None:
     np.testing.assert_allclose(record["link_position"], ANGLE[:-1], atol=1e-9)
     np.testing.assert_allclose(record["temperature"], 293.15 + record.time, atol=1e-9)
     assert any("interpolated" in note for note in record.provenance.notes)
+
+
+@pytest.mark.parametrize("cut", [0, 2000], ids=["whole", "damaged"])
+def test_an_mdf_that_was_not_finished_leaves_no_copy_behind(cut: int, tmp_path: Path) -> None:
+    """Of a logger that lost its power; a copy of a damaged one, of any size, stayed for ever."""
+    asammdf = pytest.importorskip("asammdf")
+    path, temporary = tmp_path / "run.mf4", tmp_path / "temporary"
+    temporary.mkdir()
+    with asammdf.MDF(version="4.10") as file:
+        signals = {"motor_current": CURRENT, "link_position": ANGLE}
+        file.append([asammdf.Signal(x, T, name=name, unit="A") for name, x in signals.items()])
+        file.save(path)
+    data = bytearray(path.read_bytes())
+    data[60] |= 1  # the first of the flags of what is to be finished
+    path.write_bytes(data[: len(data) - cut])
+    program = "import sys; from identification.data.survey import survey; survey(sys.argv[1])"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(path)],
+        env={**os.environ, "TMPDIR": str(temporary)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ("is not a readable MDF file" in done.stderr) is (cut > 0), done.stderr
+    assert (done.returncode == 0) is (cut == 0)
+    assert list(temporary.iterdir()) == []
 
 
 ROS_COLUMNS = {

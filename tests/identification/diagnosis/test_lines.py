@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from dataclasses import replace
@@ -22,6 +23,7 @@ from identification.balance.sensing import Sensing, sense
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint, parse_joint, toml_text
 from identification.diagnosis.lines import (
+    DERIVATIVE,
     SMOOTHED,
     Line,
     _encoder_orders,
@@ -29,6 +31,7 @@ from identification.diagnosis.lines import (
     _Joined,
     _names,
     _Pointwise,
+    _polynomial,
     _Scan,
     _Tracked,
     _without_trend,
@@ -664,3 +667,14 @@ def test_a_line_without_a_name_says_what_would_give_it_one() -> None:
     assert without_turn([line], replace(axis, gear_ratio=200 * np.pi)) == ()
     assert without_turn([line], Joint(gear_ratio=100.0)) == ()
     assert without_turn([replace(line, effects=("torque_ripple",))], axis) == ()
+
+
+@pytest.mark.parametrize("order", sorted(DERIVATIVE))
+def test_the_rates_of_a_point_are_those_of_a_polynomial(order: int) -> None:
+    """At its middle sample, of each power that the least squares take."""
+    count, degree = DERIVATIVE[order]
+    sample = np.arange(count, dtype=np.float64) - count // 2
+    for power in range(degree + 1):
+        exact = math.factorial(order) if power == order else 0.0
+        scale = float(np.abs(sample**power).max())
+        assert _polynomial(order) @ sample**power == pytest.approx(exact, abs=1e-12 * scale)

@@ -113,3 +113,46 @@ def test_files_are_not_for_a_session_that_is_opened_while_they_are_sent(
     assert page.evaluate("get('').then((s) => s.files.length)") == 0
     there = page.evaluate("id => call('GET', `/api/session/${id}`)", old)
     assert [f["name"] for f in there["files"]] == ["first.csv"]
+
+
+FORMULA = "[aria-label='Formula of columns, or the step of the time']"
+ADD = "tr:has(strong:text-is('add a formula')) >> "
+
+
+def test_half_a_formula_stands_when_the_map_is_drawn_anew(page: Any, tmp_path: Path) -> None:
+    """Another column is given a channel, another tab changes the session: what is typed stays,
+    with the focus and the place in it, and is asked about once it is whole.
+    """
+    columns, _ = CASES["degrees without a unit"]
+    page.click("#fresh")
+    page.wait_for_selector("#demo")
+    page.set_input_files("#files", [written(tmp_path, **columns)])
+    page.wait_for_selector(".map-table")
+    page.fill(f"{ADD}{FORMULA}", "link_pos * ")
+    page.fill(f"{ADD}[aria-label='Unit of the formula']", "deg")
+    with page.expect_response("**/look/*"):
+        page.select_option("select[aria-label='Sign of column iq_A']", "-1")
+    page.wait_for_timeout(200)
+    assert page.input_value(f"{ADD}{FORMULA}") == "link_pos * "
+    assert page.input_value(f"{ADD}[aria-label='Unit of the formula']") == "deg"
+
+    page.focus(f"{ADD}{FORMULA}")
+    page.keyboard.press("End")
+    page.keyboard.type("2 ")
+    with page.expect_response("**/look/*"):
+        page.evaluate("() => post('/tree', { session: 'another name' })")
+    page.wait_for_function("() => !busy() && !app.asking && document.querySelector('.map-table')")
+    page.wait_for_timeout(200)
+    page.keyboard.type("+ 1")
+    assert page.input_value(f"{ADD}{FORMULA}") == "link_pos * 2 + 1"
+    assert page.input_value("select[aria-label='Sign of column iq_A']") == "-1"
+
+    page.select_option(f"{ADD}[aria-label='Channel of the formula']", "link_velocity")
+    page.wait_for_selector(".import-problem:has-text('a unit of the kind rad/s is wanted')")
+    assert page.input_value(f"{ADD}{FORMULA}") == "link_pos * 2 + 1", "what was refused, too"
+    with page.expect_response("**/look/*") as asked:
+        page.select_option(f"{ADD}[aria-label='Channel of the formula']", "reference_position")
+    sent = asked.value.request.post_data_json["columns"]["reference_position"]
+    assert sent == {"formula": "link_pos * 2 + 1", "unit": "deg"}
+    page.wait_for_selector("tr:has(strong:text-is('formula'))")
+    assert page.input_value(f"{ADD}{FORMULA}") == "", "what was taken is no half of a formula"

@@ -150,6 +150,52 @@ def test_fields_that_are_kept_go_with_those_of_the_other_tab(tabs: Tabs) -> None
     assert (joint(mine)["name"], joint(mine)["gear_ratio"]) == ("both", -123.0)
 
 
+@pytest.mark.parametrize("kept", ["fields", "text"])
+def test_of_fields_and_text_that_were_both_edited_the_user_says_which_is_saved(
+    tabs: Tabs, kept: str
+) -> None:
+    """Each is the whole joint: the text was saved and the fields went, without a word."""
+    mine = tabs.mine
+    mine.fill("#name", "of the fields")
+    unfold(mine)
+    assert mine.is_hidden("#joint-both"), "one of them is no question"
+    text = mine.input_value("#joint-text")
+    mine.fill("#joint-text", text.replace("-160", "-161") + "\n# of the text")
+    mine.wait_for_selector("#joint-both")
+    assert findings(mine) == []
+
+    mine.click("#save")
+    mine.wait_for_selector("#error:not([hidden])")
+    assert "both edited" in mine.inner_text("#error-text")
+    assert mine.evaluate("get('/view/joint')")["text"] == tabs.text, "nothing is saved before"
+    assert mine.input_value("#name") == "of the fields"
+    assert mine.input_value("#joint-text").endswith("# of the text")
+
+    mine.click(f"#both-{kept}")
+    mine.wait_for_selector("#joint-both", state="hidden")
+    saved(mine)
+    found = joint(mine)
+    if kept == "fields":
+        assert (found["name"], found["gear_ratio"]) == ("of the fields", -160.0)
+    else:
+        assert (found["name"], found["gear_ratio"]) == ("demo joint", -161.0)
+        assert mine.evaluate("get('/view/joint')")["text"].endswith("# of the text")
+    assert mine.input_value("#name") == found["name"]
+
+
+def test_text_that_is_as_it_was_again_is_no_edit(tabs: Tabs) -> None:
+    mine = tabs.mine
+    unfold(mine)
+    text = mine.input_value("#joint-text")
+    mine.fill("#joint-text", text + "\n# a thought")
+    mine.fill("#name", "of the fields")
+    mine.wait_for_selector("#joint-both")
+    mine.fill("#joint-text", text)
+    mine.wait_for_selector("#joint-both", state="hidden")
+    saved(mine)
+    assert joint(mine)["name"] == "of the fields"
+
+
 def test_a_tab_that_has_not_heard_of_it_yet_saves_over_nothing(tabs: Tabs) -> None:
     mine, other = tabs.mine, tabs.other
     mine.evaluate("() => { app.source.close(); app.source = null; }")

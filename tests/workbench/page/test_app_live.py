@@ -137,6 +137,25 @@ def test_a_growing_file_is_followed_and_its_verdict_withdrawn_in_the_headline(
         assert [(v["id"], n["html"][:160]) for v in found["violations"] for n in v["nodes"]] == []
 
 
+def test_a_file_of_wide_characters_is_followed_too(page: Any, growing: Path) -> None:
+    """UTF-16 with its mark, as programs under Windows save text."""
+    whole = ("\n".join(lines()) + "\n").encode("utf-16")
+    cut = len(whole) // 2 | 1
+    growing.write_bytes(whole[:cut])
+    page.click("#nav-replay")
+    idle(page, "replay")
+    page.select_option("#follow-file", str(growing))
+    page.click("#follow")
+    seen = "s => app.state.job && app.state.job.text.endsWith(`, ${s} s`)"
+    page.wait_for_function(seen, arg=6, timeout=60_000)
+    with growing.open("ab") as stream:
+        stream.write(whole[cut:])
+    page.wait_for_function(seen, arg=12, timeout=60_000)
+    page.click("#follow-stop")
+    idle(page, "replay")
+    assert page.locator("#error").is_hidden()
+
+
 def test_a_stream_is_followed_as_a_file_is(page: Any, stream: str) -> None:
     host, _, port = stream.removeprefix("udp://").rpartition(":")
     head, *rows = lines()

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from identification.balance.stamps import longest_hole
 from identification.data.read import read
-from identification.data.read.csv import head_of
+from identification.data.read.csv import head_of, wide_encoding
 from identification.data.record import Record
 from identification.errors import InputError
 from irj_fmu.estimator.healthy import online_readings
@@ -72,6 +72,7 @@ class Growing:
         self.path, self.joint, self.name = path, joint, str(path)
         self._folder = Path(tempfile.mkdtemp(prefix="irj-"))
         self._head, self._at = b"", 0
+        self._wide: str | None = None
         self._row, self._lines = b"", 0
 
     def __enter__(self) -> Self:
@@ -102,7 +103,7 @@ class Growing:
                 f"{self.path}: cannot be read ({error.strerror}); give a CSV file that is being "
                 "written"
             ) from None
-        whole = came[: came.rfind(b"\n") + 1]
+        whole, read_to = self._lines_of(came)
         if not whole or (not self._at and whole.count(b"\n") < FIRST_ROWS):
             return None
         part = self._folder / "part.csv"
@@ -119,8 +120,19 @@ class Growing:
         again = 2 if self._row else 0
         rows = (x for x in reversed(whole.splitlines(keepends=True)) if _is_row(x))
         self._row = next(rows, self._row)
-        self._at, self._lines = self._at + len(whole), self._lines + whole.count(b"\n")
+        self._at, self._lines = self._at + read_to, self._lines + whole.count(b"\n")
         return made.take(np.arange(len(made)) >= again) if len(made) > again else None
+
+    def _lines_of(self, came: bytes) -> tuple[bytes, int]:
+        """The whole lines of what came, not as UTF-16, and how many bytes of the file they are."""
+        if not self._at:
+            self._wide = wide_encoding(came)
+        if self._wide is None:
+            end = came.rfind(b"\n") + 1
+            return came[:end], end
+        text = came[: len(came) // 2 * 2].decode(self._wide, errors="replace")
+        whole = text[: text.rfind("\n") + 1]
+        return whole.encode(), len(whole.encode(self._wide))
 
 
 def follow(
