@@ -21,7 +21,7 @@ from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
 from irj_fmu.imported.file_schema import BOUNDS, CHANNEL, MODEL, START
-from irj_fmu.imported.model import Mapped, UserModel, load_user_model
+from irj_fmu.imported.model import Bounds, Mapped, UserModel, load_user_model
 from irj_fmu.imported.port import noted
 
 _TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", TABLE, LAWS)
@@ -179,15 +179,14 @@ def _table(table: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]
     return found
 
 
-def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, tuple[float, float]]:
-    found = {}
+def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, Bounds]:
+    found: dict[str, Bounds] = {}
     for name, entry in _table(table, "parameters", path).items():
         where = f"{path}: [model.parameters] {name}"
         if not isinstance(entry, Mapping) or set(entry) - set(BOUNDS.names):
             raise InputError(f"{where} must be a table with low and high, or {{}}")
         low, high = (
-            finite(entry[k], f"{where} {k}") if k in entry else v
-            for k, v in (("low", -math.inf), ("high", math.inf))
+            finite(entry[k], f"{where} {k}") if k in entry else None for k in ("low", "high")
         )
         found[name] = (low, high)
     return found
