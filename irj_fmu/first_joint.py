@@ -22,6 +22,7 @@ from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 from irj_fmu.host.fmu import FmuError
 from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.file import fmu_named
 from irj_fmu.imported.library import Kind, UserFmu
 from irj_fmu.imported.model import DRIVES, own_bounds
 from irj_fmu.imported.run import Runner, Window
@@ -57,7 +58,13 @@ class _Draft:
     notes: list[str] = field(default_factory=list)
 
 
-def first_joint(path: str | Path, record: Record, joint: Joint | None = None) -> str:
+def first_joint(
+    path: str | Path,
+    record: Record,
+    joint: Joint | None = None,
+    *,
+    folder: Path | None = None,
+) -> str:
     """The text of a joint file whose model is an FMU.
 
     Parameters
@@ -68,6 +75,8 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
         Only its channels are mapped; both positions give the gear ratio.
     joint : Joint, optional
         Gear ratio and motor constant where they are known.
+    folder : Path, optional
+        Where the file goes, see :func:`irj_fmu.imported.file.fmu_named`.
 
     Raises
     ------
@@ -103,7 +112,7 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
     _run(fmu, kind, [m[0] for m in outputs.values()])
     _starts(draft, fmu, kind, outputs, [*named["local"], *named["parameter"]])
     _parameters(draft, named["parameter"])
-    return _text(draft, fmu, kind, known, why)
+    return _text(draft, fmu_named(fmu.path, folder), kind, known, why)
 
 
 def _ratio(record: Record, joint: Joint | None) -> tuple[float, str]:
@@ -310,7 +319,7 @@ def _parameters(draft: _Draft, variables: Sequence[Any]) -> None:
         )
 
 
-def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> str:
+def _text(draft: _Draft, fmu: str, kind: Kind, joint: Joint, why: str) -> str:
     effects = [
         key for key in EFFECTS if any(key in n.lower().split(".")[-1] for n in draft.parameters)
     ]
@@ -330,7 +339,7 @@ def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> st
     lines += [
         "",
         "[model]",
-        f"fmu = {toml_string(str(fmu.path))}",
+        f"fmu = {toml_string(fmu)}",
         f'kind = "{kind}"',
         f"window = {WINDOW!r}" if draft.starts else "# window: nothing was found that starts it",
         "",

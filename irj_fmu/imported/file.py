@@ -240,6 +240,12 @@ def outside_correction(
     return replace(made, shapes={n: x for n, x in made.shapes.items() if n in smooth})
 
 
+def fmu_named(path: Path, folder: Path | None) -> str:
+    """What a joint file in a folder calls an FMU: beside it its name, so that both may move."""
+    beside = folder is not None and path.parent == folder.resolve()
+    return path.name if beside else str(path)
+
+
 def user_joint_text(
     model: UserModel,
     stderr: Mapping[str, float | None] = MappingProxyType({}),
@@ -255,7 +261,7 @@ def user_joint_text(
     stderr : mapping of str to float or None, optional
         Standard errors that are written beside the values, in the same units.
     folder : Path, optional
-        Where the file goes: an FMU beside it is named without its path.
+        Where the file goes, see :func:`fmu_named`.
     named : str, optional
         What the file calls the FMU, where that is not where it lies.
     """
@@ -264,9 +270,7 @@ def user_joint_text(
         outside=model.correction.labels if model.correction else (),
     )
     body = "\n".join(line for line in head.splitlines() if not line.startswith("model = "))
-    path = model.fmu.path
-    beside = folder is not None and path.parent == folder.resolve()
-    name = named or (path.name if beside else str(path))
+    name = named or fmu_named(model.fmu.path, folder)
     lines = [
         "[model]",
         f"fmu = {toml_string(name)}",
@@ -316,4 +320,4 @@ def _mapped(key: str, word: str, other: str, mapped: Mapped) -> str:
     return f"{toml_key(key)} = {{ {word} = {toml_string(other)}, scale = {mapped.scale!r} }}"
 
 
-__all__ = ["is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]
+__all__ = ["fmu_named", "is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]

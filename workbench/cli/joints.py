@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from pathlib import Path
 
 from identification.data.joint_library import Entry, chosen, entries, packaged, side_by_side
 from identification.errors import InputError
@@ -76,7 +77,8 @@ def run_joint(arguments: Namespace) -> int:
     known = open_joint(arguments.like) if arguments.like else None
     records, _ = open_records([arguments.record], known)
     try:
-        text = first_joint(arguments.fmu, records[0], known)
+        folder = Path(arguments.output).parent if arguments.output else None
+        text = first_joint(arguments.fmu, records[0], known, folder=folder)
     except FmuError as error:
         raise InputError(str(error)) from error
     guesses = [line for line in text.splitlines() if "#" in line]
