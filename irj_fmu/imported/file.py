@@ -75,14 +75,15 @@ def load_user_joint(path: str | Path, fmu: str | Path | None = None) -> UserMode
     MODEL.check(table, f"{path}: [model]")
     if "fmu" not in table:
         raise InputError(f'{path}: [model] has no fmu; write fmu = "file.fmu"')
-    if not isinstance(table["fmu"], str) or not table["fmu"].strip():
+    named = table["fmu"]
+    if not isinstance(named, str) or not named.strip() or "\0" in named:
         raise InputError(
-            f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu "
+            f"{path}: [model] fmu = {_shown(named)} is not the name of an FMU; write fmu "
             '= "file.fmu"'
         )
     rest = {k: v for k, v in data.items() if k in ("joint", "columns", TABLE, LAWS)}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
-    place = path.parent / table["fmu"] if fmu is None else Path(fmu)
+    place = path.parent / named if fmu is None else Path(fmu)
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
     channels, bounds, start = (
         _pairs(table, "channels", path),

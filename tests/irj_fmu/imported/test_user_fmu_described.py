@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from identification.data.joint_file import load_joint
 from identification.errors import InputError
 from irj_fmu.first_joint import first_joint
 from irj_fmu.host.fmu import Fmu, FmuError
@@ -102,6 +103,15 @@ def test_bounds_that_a_joint_file_leaves_out_are_those_of_the_fmu(
     )
     (found,) = load_user_joint(joint).parameters
     assert (found.low, found.high) == wanted
+
+
+def test_a_name_with_a_zero_character_is_no_name(tmp_path: Path) -> None:
+    joint = tmp_path / "user.toml"
+    joint.write_text('[joint]\nname = "a"\n[model]\nfmu = "a\\u0000b"\n')
+    with pytest.raises(InputError, match="is not the name of an FMU"):
+        load_user_joint(joint)
+    with pytest.raises(InputError, match="not the name of a file"):
+        load_joint(tmp_path / "a\0b")
 
 
 def test_a_fit_stays_within_the_bounds_of_the_fmu(tmp_path: Path) -> None:
