@@ -73,8 +73,12 @@ def run_joint(arguments: Namespace) -> int:
     """`irj joint new MODEL.fmu --record REC`."""
     from irj_fmu.first_joint import first_joint
     from irj_fmu.host.fmu import FmuError
+    from irj_fmu.imported.file import is_user_joint, load_user_joint
 
-    known = open_joint(arguments.like) if arguments.like else None
+    like = arguments.like
+    known = None
+    if like:
+        known = load_user_joint(like).joint if is_user_joint(like) else open_joint(like)
     records, _ = open_records([arguments.record], known)
     try:
         folder = Path(arguments.output).parent if arguments.output else None
