@@ -22,8 +22,9 @@ from identification.data.units import base_unit, same_dimension
 from identification.errors import InputError
 from irj_fmu.host.fmu import FmuError
 from irj_fmu.host.signals import FloatArray
+from irj_fmu.imported.file import fmu_named
 from irj_fmu.imported.library import Kind, UserFmu
-from irj_fmu.imported.model import DRIVES
+from irj_fmu.imported.model import DRIVES, own_bounds
 from irj_fmu.imported.run import Runner, Window
 
 SIDES: Final = ("motor", "link")
@@ -57,7 +58,13 @@ class _Draft:
     notes: list[str] = field(default_factory=list)
 
 
-def first_joint(path: str | Path, record: Record, joint: Joint | None = None) -> str:
+def first_joint(
+    path: str | Path,
+    record: Record,
+    joint: Joint | None = None,
+    *,
+    folder: Path | None = None,
+) -> str:
     """The text of a joint file whose model is an FMU.
 
     Parameters
@@ -68,11 +75,15 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
         Only its channels are mapped; both positions give the gear ratio.
     joint : Joint, optional
         Gear ratio and motor constant where they are known.
+    folder : Path, optional
+        Where the file goes, see :func:`irj_fmu.imported.file.fmu_named`.
 
     Raises
     ------
     InputError
         An FMU that cannot be read, or none of whose outputs goes with a channel of the record.
+    FmuError
+        An FMU that does not run on this machine.
     """
     fmu = UserFmu(Path(path))
     kind = fmu.kinds()[0]
@@ -80,7 +91,11 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
     ratio, why = _ratio(record, joint)
     known = joint or Joint(name=fmu.path.stem, kind=record.kind, gear_ratio=ratio)
     named = {
-        c: [v for v in fmu.variables.values() if v.causality == c and v.type in ("Real", "Float64")]
+        c: [
+            v
+            for v in fmu.variables.values()
+            if v.causality == c and v.type in ("Real", "Float64") and not v.shape
+        ]
         for c in ("input", "output", "local", "parameter")
     }
     _channels(draft, named["input"], record, known, ratio, driving=True)
@@ -94,9 +109,10 @@ def first_joint(path: str | Path, record: Record, joint: Joint | None = None) ->
             f"{there or 'none'}; channels: {', '.join(record.channels)}); write "
             "[model.channels] by hand"
         )
+    _run(fmu, kind, [m[0] for m in outputs.values()])
     _starts(draft, fmu, kind, outputs, [*named["local"], *named["parameter"]])
     _parameters(draft, named["parameter"])
-    return _text(draft, fmu, kind, known, why)
+    return _text(draft, fmu_named(fmu.path, folder), kind, known, why)
 
 
 def _ratio(record: Record, joint: Joint | None) -> tuple[float, str]:
@@ -212,7 +228,7 @@ def _starts(
         return
     names = [m[0] for m in places.values()]
     for v in variables:
-        if v.start is None or v.name in names:
+        if v.start is None:
             continue
         for push in PUSHES:
             try:
@@ -263,13 +279,19 @@ def _change(
 ) -> FloatArray:
     """What a push (value, push) of a variable changes in outputs over two samples, (3, outputs)."""
     value, push = given
-    runner = Runner(fmu, kind, inputs=(), outputs=outputs, starts=(name,), settings={})
+    runs = [_run(fmu, kind, outputs, {name: value + more}) for more in (0.0, push)]
+    return np.asarray(runs[1] - runs[0])
+
+
+def _run(
+    fmu: UserFmu, kind: Kind, outputs: Sequence[str], starts: Mapping[str, float] | None = None
+) -> FloatArray:
+    """Outputs over two samples, (3, outputs)."""
+    own = starts or {}
+    runner = Runner(fmu, kind, inputs=(), outputs=outputs, starts=tuple(own), settings={})
     time = (fmu.grain(kind) or SHORT) * np.arange(3.0)
     none = np.empty((3, 0))
-    runs = [
-        runner.run(Window(time, none, none, np.array([value + more])), {}) for more in (0.0, push)
-    ]
-    return np.asarray(runs[1] - runs[0])
+    return runner.run(Window(time, none, none, np.array(list(own.values()))), {})
 
 
 def _parameters(draft: _Draft, variables: Sequence[Any]) -> None:
@@ -277,21 +299,27 @@ def _parameters(draft: _Draft, variables: Sequence[Any]) -> None:
     for v in variables:
         if v.name in draft.starts or v.start is None:
             continue
-        if v.min is not None and v.max is not None:
+        own = own_bounds(v)
+        if own[0] < own[1] and all(map(math.isfinite, own)):
             draft.parameters[v.name] = "{}  # bounds of the FMU"
             continue
         value = float(v.start)
-        if value == 0:
-            draft.notes.append(f"{v.name}: starts at 0 and says no bounds; add it with bounds")
-            continue
         ends = sorted((value / REACH, value * REACH))
+        low, high = max(ends[0], own[0]), min(ends[1], own[1])
+        if not (low < high and math.isfinite(low) and math.isfinite(high)):
+            said = (
+                f"bounds {own[0]:g} to {own[1]:g}" if any(map(math.isfinite, own)) else "no bounds"
+            )
+            draft.notes.append(f"{v.name}: starts at {value:g} and says {said}; add it with bounds")
+            continue
+        cut = ", within the FMU's own bound" if [low, high] != ends else ""
         draft.parameters[v.name] = (
-            f"{{ low = {ends[0]:.6g}, high = {ends[1]:.6g} }}  # start value {value:g}, a factor "
-            f"of {REACH:g} either way"
+            f"{{ low = {low:.6g}, high = {high:.6g} }}  # start value {value:g}, a factor "
+            f"of {REACH:g} either way{cut}"
         )
 
 
-def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> str:
+def _text(draft: _Draft, fmu: str, kind: Kind, joint: Joint, why: str) -> str:
     effects = [
         key for key in EFFECTS if any(key in n.lower().split(".")[-1] for n in draft.parameters)
     ]
@@ -311,7 +339,7 @@ def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> st
     lines += [
         "",
         "[model]",
-        f"fmu = {toml_string(str(fmu.path))}",
+        f"fmu = {toml_string(fmu)}",
         f'kind = "{kind}"',
         f"window = {WINDOW!r}" if draft.starts else "# window: nothing was found that starts it",
         "",
@@ -329,7 +357,13 @@ def _text(draft: _Draft, fmu: UserFmu, kind: Kind, joint: Joint, why: str) -> st
         entry = f"{{ channel = {toml_string(channel)}, scale = {scale!r} }}"
         lines.append(f"{toml_key(name)} = {entry}  # {reason}")
     lines += ["", *(f"# {note}" for note in draft.notes)] if draft.notes else []
-    return "\n".join(lines) + "\n"
+    return "\n".join(map(_one_line, lines)) + "\n"
+
+
+def _one_line(line: str) -> str:
+    """A line of the file; names and units in its comment may hold line breaks, which would end
+    it."""
+    return " ".join(line.splitlines())
 
 
 __all__ = ["first_joint"]

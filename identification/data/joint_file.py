@@ -252,6 +252,8 @@ def load_joint(path: str | Path) -> Joint:
         ) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; a joint file is TOML") from None
+    except ValueError:  # a zero character, which a study may spell
+        raise InputError(f"{str(path)!r}: not the name of a file; give that of a joint") from None
     return parse_joint(from_toml(text, str(path)), str(path))
 
 

@@ -237,19 +237,24 @@ def _compiled(
             raise InputError(
                 f"compiler {words[0]!r} cannot be started ({error.strerror}); check `cc`"
             ) from error
-        if done.returncode != 0:
+        made = Path(folder) / library
+        if done.returncode != 0 or not made.is_file():
             if _FULL.search(done.stderr):
                 raise InputError(no_room)
             first = next(
                 (line for line in done.stderr.splitlines() if "error" in line),
                 done.stderr.strip()[:200],
             )
-            said = first or f"it said nothing and ended with {done.returncode}"
+            said = first or (
+                f"it said nothing and ended with {done.returncode}"
+                if done.returncode
+                else "it made no library"
+            )
             raise InputError(
                 f"compiler {words[0]!r} failed for {target} ({said}); try it by itself, or give "
                 "another one with --cc"
             )
-        return (Path(folder) / library).read_bytes()
+        return made.read_bytes()
 
 
 def model_code(name: str, functions: Sequence[Any]) -> bytes:

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, Literal, Self, final
 
 from identification.errors import InputError
+from irj_fmu.host.described import described, unreadable
 from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import Fault, Signal
 
@@ -66,7 +67,7 @@ class Fmu:
     """
 
     def __init__(self, path: Path) -> None:
-        from fmpy import extract, read_model_description
+        from fmpy import extract
 
         self.path = Path(path).resolve()
         self._gone: weakref.finalize[..., Fmu] | None = None
@@ -80,10 +81,10 @@ class Fmu:
                 self.folder = Path(folder)
             else:
                 self.folder = self.path
-            self.description: Any = read_model_description(str(self.folder))
+            self.description: Any = described(self.folder)
         except Exception as error:
             self.close()
-            raise InputError(f"{self.path}: not a readable FMU ({error})") from error
+            raise unreadable(self.path, error) from error
         if self.description.fmiVersion != "2.0":
             self.close()
             raise InputError(

@@ -21,7 +21,7 @@ from identification.data.typed_laws import LAWS
 from identification.errors import InputError
 from irj_fmu.imported.correction import PREFIX, Correction, correction_of
 from irj_fmu.imported.file_schema import BOUNDS, CHANNEL, MODEL, START
-from irj_fmu.imported.model import Mapped, UserModel, load_user_model
+from irj_fmu.imported.model import Bounds, Mapped, UserModel, load_user_model
 from irj_fmu.imported.port import noted
 
 _TABLES: Final = ("joint", "model", "columns", "fitted", "provenance", TABLE, LAWS)
@@ -75,14 +75,15 @@ def load_user_joint(path: str | Path, fmu: str | Path | None = None) -> UserMode
     MODEL.check(table, f"{path}: [model]")
     if "fmu" not in table:
         raise InputError(f'{path}: [model] has no fmu; write fmu = "file.fmu"')
-    if not isinstance(table["fmu"], str) or not table["fmu"].strip():
+    named = table["fmu"]
+    if not isinstance(named, str) or not named.strip() or "\0" in named:
         raise InputError(
-            f"{path}: [model] fmu = {_shown(table['fmu'])} is not the name of an FMU; write fmu "
+            f"{path}: [model] fmu = {_shown(named)} is not the name of an FMU; write fmu "
             '= "file.fmu"'
         )
     rest = {k: v for k, v in data.items() if k in ("joint", "columns", TABLE, LAWS)}
     joint = parse_joint({**rest, "joint": {**rest.get("joint", {}), "model": "hd1"}}, str(path))
-    place = path.parent / table["fmu"] if fmu is None else Path(fmu)
+    place = path.parent / named if fmu is None else Path(fmu)
     fitted = {str(k): _value(v, f"{path}: [fitted] {k}") for k, v in data.get("fitted", {}).items()}
     channels, bounds, start = (
         _pairs(table, "channels", path),
@@ -179,15 +180,14 @@ def _table(table: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]
     return found
 
 
-def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, tuple[float, float]]:
-    found = {}
+def _bounds(table: Mapping[str, Any], path: Path) -> dict[str, Bounds]:
+    found: dict[str, Bounds] = {}
     for name, entry in _table(table, "parameters", path).items():
         where = f"{path}: [model.parameters] {name}"
         if not isinstance(entry, Mapping) or set(entry) - set(BOUNDS.names):
             raise InputError(f"{where} must be a table with low and high, or {{}}")
         low, high = (
-            finite(entry[k], f"{where} {k}") if k in entry else v
-            for k, v in (("low", -math.inf), ("high", math.inf))
+            finite(entry[k], f"{where} {k}") if k in entry else None for k in ("low", "high")
         )
         found[name] = (low, high)
     return found
@@ -241,6 +241,12 @@ def outside_correction(
     return replace(made, shapes={n: x for n, x in made.shapes.items() if n in smooth})
 
 
+def fmu_named(path: Path, folder: Path | None) -> str:
+    """What a joint file in a folder calls an FMU: beside it its name, so that both may move."""
+    beside = folder is not None and path.parent == folder.resolve()
+    return path.name if beside else str(path)
+
+
 def user_joint_text(
     model: UserModel,
     stderr: Mapping[str, float | None] = MappingProxyType({}),
@@ -256,7 +262,7 @@ def user_joint_text(
     stderr : mapping of str to float or None, optional
         Standard errors that are written beside the values, in the same units.
     folder : Path, optional
-        Where the file goes: an FMU beside it is named without its path.
+        Where the file goes, see :func:`fmu_named`.
     named : str, optional
         What the file calls the FMU, where that is not where it lies.
     """
@@ -265,9 +271,7 @@ def user_joint_text(
         outside=model.correction.labels if model.correction else (),
     )
     body = "\n".join(line for line in head.splitlines() if not line.startswith("model = "))
-    path = model.fmu.path
-    beside = folder is not None and path.parent == folder.resolve()
-    name = named or (path.name if beside else str(path))
+    name = named or fmu_named(model.fmu.path, folder)
     lines = [
         "[model]",
         f"fmu = {toml_string(name)}",
@@ -317,4 +321,4 @@ def _mapped(key: str, word: str, other: str, mapped: Mapped) -> str:
     return f"{toml_key(key)} = {{ {word} = {toml_string(other)}, scale = {mapped.scale!r} }}"
 
 
-__all__ = ["is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]
+__all__ = ["fmu_named", "is_user_joint", "load_user_joint", "outside_correction", "user_joint_text"]

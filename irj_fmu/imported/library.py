@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import math
 import shutil
 import tempfile
 import weakref
@@ -22,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.errors import InputError
+from irj_fmu.host.described import described, unreadable
 from irj_fmu.host.fmu import FmuError, Number, callbacks, near_names
 from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import FloatArray
@@ -39,6 +41,9 @@ _P, _D, _U, _I, _B = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t, ctypes.c
 _LOG3: Final = ctypes.CFUNCTYPE(None, _P, _I, ctypes.c_char_p, ctypes.c_char_p)
 _EVENT2: Final = 48  # bytes of fmi2EventInfo: five booleans and a double, with room to spare
 _SETTLE: Final = 100
+NAMED: Final = 10_000
+"""Most elements of an array that are named one by one: each costs some 36 us whenever the FMU is
+opened. A larger one is a table, none of whose elements is a signal."""
 STATUS: Final = {2: "discard", 3: "error", 4: "fatal", 5: "pending"}
 
 
@@ -70,7 +75,7 @@ class UserFmu:
     """
 
     def __init__(self, path: Path) -> None:
-        from fmpy import extract, read_model_description
+        from fmpy import extract
 
         self.path = Path(path).resolve()
         if not self.path.exists():
@@ -86,13 +91,9 @@ class UserFmu:
                 self.folder = Path(folder)
             else:
                 self.folder = self.path
-            if not (self.folder / "modelDescription.xml").is_file():
-                raise InputError("it holds no modelDescription.xml; give an .fmu file")
-            self.description: Any = read_model_description(str(self.folder))
+            self.description: Any = described(self.folder)
         except Exception as error:
-            raise InputError(
-                f"{self.path}: not a readable FMU ({' '.join(str(error).split())})"
-            ) from error
+            raise unreadable(self.path, error) from error
         if str(self.description.fmiVersion)[:2] not in ("2.", "3."):
             raise InputError(
                 f"{self.path}: FMI {self.description.fmiVersion} is not supported; export it as "
@@ -102,12 +103,21 @@ class UserFmu:
         self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
         self.elements: dict[str, tuple[str, int]] = {}
         self._scalars: dict[str, tuple[str, ...]] = {}
-        for array in [v for v in self.variables.values() if v.shape and v.type in _REALS]:
-            scalars = _elements(array)
+        reals = [v for v in self.variables.values() if v.type in _REALS]
+        for scalar in [v for v in reals if not v.shape]:
+            _number_of(scalar, self.path.name)
+        for array in [v for v in reals if v.shape and math.prod(v.shape) <= NAMED]:
+            scalars = _elements(array, self.path.name)
             self._scalars[array.name] = tuple(scalars)
             self.elements |= {n: (array.name, i) for i, n in enumerate(scalars)}
             self.variables |= {n: v for n, v in scalars.items() if n not in self.variables}
         slopes = [d.variable for d in self.description.derivatives]
+        for v in slopes:
+            if math.prod(v.shape or ()) > NAMED:
+                raise InputError(
+                    f"{self.path.name}: {v.name} holds {math.prod(v.shape)} states; a joint model "
+                    f"has at most {NAMED}"
+                )
         self.states: tuple[str, ...] = tuple(
             name
             for v in slopes
@@ -195,10 +205,14 @@ class UserFmu:
         """The same for a scalar of type Real or Float64."""
         found = self.variable(name)
         if found.type in _REALS and found.shape:
-            own = self.scalars(name)
+            count, own = math.prod(found.shape), self.scalars(name)
             raise InputError(
-                f"{self.path.name}: variable {name!r} is an array; name one element of it, "
-                + (f"{own[0]} to {own[-1]}" if len(own) > 1 else own[0])
+                f"{self.path.name}: variable {name!r} is an array; "
+                + (
+                    f"its {count} elements are no signals or parameters of a fit"
+                    if not 0 < count <= NAMED
+                    else f"name one element of it, {own[0]}{f' to {own[-1]}' * (count > 1)}"
+                )
             )
         if found.type not in _REALS:
             raise InputError(
@@ -229,9 +243,25 @@ class Block:
     places: IntArray | None = None
 
 
-def _elements(array: Any) -> dict[str, Any]:
+def _number_of(scalar: Any, fmu: str) -> None:
+    """Refuse a start value that is no number."""
+    try:
+        float(0.0 if scalar.start is None else scalar.start)
+    except ValueError:
+        raise InputError(
+            f"{fmu}: the start value {str(scalar.start)[:60]!r} of {scalar.name} is not one "
+            "number; export it again"
+        ) from None
+
+
+def _elements(array: Any, fmu: str) -> dict[str, Any]:
     """Description of each element of an array by name, counted from 1, row by row."""
     starts = str(array.start).split() if array.start is not None else []
+    if len(starts) not in (0, 1, math.prod(array.shape)):
+        raise InputError(
+            f"{fmu}: {array.name} has {math.prod(array.shape)} elements and {len(starts)} start "
+            "values; export it again"
+        )
     out = {}
     for place, index in enumerate(np.ndindex(*array.shape)):
         scalar = copy.copy(array)

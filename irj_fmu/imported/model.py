@@ -23,6 +23,8 @@ from irj_fmu.imported.correction import Correction
 from irj_fmu.imported.library import Kind, UserFmu
 from irj_fmu.imported.run import Runner, Window
 
+Bounds = tuple[float | None, float | None]
+"""Lower and upper bound of a parameter; None: that of the FMU."""
 DRIVES: Final = ("motor_current", "motor_torque", "motor_voltage")
 _SLOPE_OF: Final = {"motor_velocity": "motor_position", "link_velocity": "link_position"}
 _SLOPE_TIME: Final = 0.02
@@ -203,7 +205,7 @@ def _first(record: Record, channel: str, row: int, part: slice) -> float:
 def load_user_model(
     path: str | Path,
     columns: Mapping[str, str | tuple[str, float]],
-    parameters: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    parameters: Sequence[str] | Mapping[str, Bounds] = (),
     *,
     start: Mapping[str, str | tuple[str, float] | Number] | None = None,
     joint: Joint | None = None,
@@ -221,7 +223,8 @@ def load_user_model(
         Record channel to variable, or to ``(variable, scale)`` where variable = scale * channel in
         SI. Inputs of the FMU are driven by their channel, other variables are compared with it.
     parameters : sequence of str, or mapping of str to (low, high)
-        Parameters that a fit may move, with bounds. Without bounds those of the FMU hold.
+        Parameters that a fit may move, with bounds. A bound that is left out, or None, is that of
+        the FMU.
     start : mapping, optional
         Variable to the channel (or ``(channel, scale)``) whose first sample starts it, or to a
         number. Start values from channels are estimated with the parameters, as measurements have
@@ -352,7 +355,7 @@ def _starts(
 
 
 def _parameters(
-    fmu: UserFmu, parameters: Sequence[str] | Mapping[str, tuple[float, float]]
+    fmu: UserFmu, parameters: Sequence[str] | Mapping[str, Bounds]
 ) -> tuple[UserParameter, ...]:
     found = []
     for name in parameters:
@@ -361,8 +364,11 @@ def _parameters(
             raise InputError(
                 f"{fmu.path.name}: {name!r} is no parameter that can be set ({variable.causality})"
             )
-        own = (_bound(variable.min, -math.inf), _bound(variable.max, math.inf))
-        low, high = parameters[name] if isinstance(parameters, Mapping) else own
+        given = parameters[name] if isinstance(parameters, Mapping) else (None, None)
+        low, high = (
+            theirs if mine is None else mine
+            for mine, theirs in zip(given, own_bounds(variable), strict=True)
+        )
         value = float(variable.start)
         if not low < high:
             raise InputError(
@@ -373,8 +379,10 @@ def _parameters(
     return tuple(found)
 
 
-def _bound(text: Any, default: float) -> float:
-    return default if text is None else float(text)
+def own_bounds(variable: Any) -> tuple[float, float]:
+    """The bounds that an FMU states for a variable; infinite ones where it states none."""
+    low, high = variable.min, variable.max
+    return -math.inf if low is None else float(low), math.inf if high is None else float(high)
 
 
 def start_values(windows: Sequence[Window]) -> FloatArray:
@@ -383,10 +391,12 @@ def start_values(windows: Sequence[Window]) -> FloatArray:
 
 
 __all__ = [
+    "Bounds",
     "Mapped",
     "UserModel",
     "UserParameter",
     "at_least_one",
     "load_user_model",
+    "own_bounds",
     "start_values",
 ]

@@ -402,9 +402,14 @@ def test_refuses_an_unusable_place(tmp_path: Path) -> None:
         build_plant(joint(), tmp_path / "a.zip")
 
 
-def test_refuses_a_failing_compiler_without_leaving_a_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="compiler"):
-        build_plant(joint(), tmp_path / "a.fmu", cc="false")
+@pytest.mark.parametrize(
+    ("cc", "said"), [("false", "said nothing and ended with 1"), ("true", "it made no library")]
+)
+def test_refuses_a_failing_compiler_without_leaving_a_file(
+    tmp_path: Path, cc: str, said: str
+) -> None:
+    with pytest.raises(InputError, match=f"compiler '{cc}' failed for .*{said}"):
+        build_plant(joint(), tmp_path / "a.fmu", cc=cc)
     assert list(tmp_path.iterdir()) == []
 
 

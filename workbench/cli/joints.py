@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
+from pathlib import Path
 
 from identification.data.joint_library import Entry, chosen, entries, packaged, side_by_side
 from identification.errors import InputError
@@ -72,11 +73,16 @@ def run_joint(arguments: Namespace) -> int:
     """`irj joint new MODEL.fmu --record REC`."""
     from irj_fmu.first_joint import first_joint
     from irj_fmu.host.fmu import FmuError
+    from irj_fmu.imported.file import is_user_joint, load_user_joint
 
-    known = open_joint(arguments.like) if arguments.like else None
+    like = arguments.like
+    known = None
+    if like:
+        known = load_user_joint(like).joint if is_user_joint(like) else open_joint(like)
     records, _ = open_records([arguments.record], known)
     try:
-        text = first_joint(arguments.fmu, records[0], known)
+        folder = Path(arguments.output).parent if arguments.output else None
+        text = first_joint(arguments.fmu, records[0], known, folder=folder)
     except FmuError as error:
         raise InputError(str(error)) from error
     guesses = [line for line in text.splitlines() if "#" in line]

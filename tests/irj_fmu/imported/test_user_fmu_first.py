@@ -17,6 +17,7 @@ from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
 from tests.irj_fmu.imported.test_user_fmu import START
 from tests.user_fmus.make import Make, build
+from tests.user_fmus.makes import write_record
 from tests.user_fmus.plant import foreign, recorded
 from tests.user_fmus.records import TRUTH, axis
 from workbench.cli.main import main
@@ -38,12 +39,30 @@ def test_a_file_from_the_command_line_fits_as_it_stands(
     assert "motor_torque = " in said
     assert "no side in the name, motor side assumed" in said
     assert "CHECK: one side is recorded" in said
-    model = load_user_joint(out)
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for path in (fmu, out):  # the file names an FMU beside it without its path
+        path.rename(moved / path.name)
+    model = load_user_joint(moved / out.name)
     assert {m.variable: m.channel for m in model.starts} == START
     assert model.joint.effects == ("coulomb", "gravity", "viscous")
     found = fit(model, record)
     for name, value in TRUTH.items():
         assert found.values[name] == pytest.approx(value, rel=5e-3), name
+
+
+def test_a_joint_file_of_an_fmu_gives_gear_ratio_and_motor_constant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fmu = build("Axis", tmp_path, Make(2, ("CoSimulation",)))
+    write_record(axis(seconds=1.0), tmp_path / "run.npz")
+    known = Joint(name="geared", gear_ratio=-50.0, torque_per_current=-4.0)
+    like = tmp_path / "like.toml"
+    like.write_text(first_joint(fmu, axis(seconds=1.0), known))
+    words = ["joint", "new", str(fmu), "--record", str(tmp_path / "run.npz"), "--like", str(like)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "gear_ratio = -50.0  # as given\ntorque_per_current = -4.0\n" in said
 
 
 def test_both_sides_are_mapped_and_the_gear_ratio_is_read_off(tmp_path: Path) -> None:
