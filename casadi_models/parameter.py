@@ -26,12 +26,10 @@ Role = Literal[
     "order",
     "range",
 ]
-WRONG_SCALE: Final = 20.0
-"""Most by which a scale of torques can be wrong: the check of the records refuses a larger factor
-between drive and link torque."""
 WRONG_RATIO: Final = 2.0
-"""The same of one position against the other: the check refuses positions whose ratio is a few
-percent off the gear ratio, and what torsion adds to that is less than the motion."""
+"""Most by which the scale of one position against the other can be wrong: the check of the records
+refuses positions whose ratio is a few percent off the gear ratio, and what torsion adds to that is
+less than the motion."""
 Typical = float | Mapping[str, float] | None
 """A usual size, or one for each place, or none."""
 

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from ..effect import ANYTHING_KNOWN, SECOND_BALANCE, TORQUE_SENSOR, Requirement, effect
-from ..parameter import WRONG_SCALE, scale_error
+from ..parameter import signed
 from ..signals import Expression, LocalSignals
 
 
@@ -13,10 +13,10 @@ from ..signals import Expression, LocalSignals
     family="sensor",
     acts_on=("drive",),
     parameters=(
-        scale_error(
+        signed(
             "motor_constant_error",
+            "1",
             "relative error: true torque = (1 + error) times the stated one",
-            WRONG_SCALE,
             typical=0.15,
         ),
     ),

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 from ..effect import effect
-from ..parameter import WRONG_SCALE, scale_error
+from ..parameter import signed
 from ..signals import Expression, LocalSignals, gain_error
 
 
@@ -13,10 +13,10 @@ from ..signals import Expression, LocalSignals, gain_error
     family="sensor",
     acts_on=("torque_sensor",),
     parameters=(
-        scale_error(
+        signed(
             "torque_sensor_gain",
+            "1",
             "relative error of the sensor: reading = (1 + error) times the true torque",
-            WRONG_SCALE,
             typical=0.1,
         ),
     ),

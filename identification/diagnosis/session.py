@@ -650,16 +650,20 @@ class Session:
         return replace(ranking, everything=renewed, significant=ranking.significant | {label})
 
     def _shown_elsewhere(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
-        """The ranking with the names that the training records hardly need, or that a balance
-        without them is against, and that held-out ones fall by, in units of the noise, once they
-        are fitted whole. Asked only where nothing else is left to claim and the model stands over
-        its floor.
+        """The ranking with the names that the training records hardly need, and that held-out ones
+        fall by once they are fitted whole, and with those that another balance is against and that
+        lower the residual over the noise. Asked only where nothing else is left to claim and the
+        model stands over its floor.
         """
         if not self._over(now):
             return ranking
         proved: dict[str, float] = {}
         refused = frozenset(self._refused)
-        for t in (*unproved(ranking, base, refused), *outvoted(ranking, base, refused)):
+        for t in unproved(ranking, base, refused):
+            drop = held_drop(now.held_out, self.bench.added(t, now).held_out, t.balance)
+            if drop >= least_drop(t, base):
+                proved[t.candidate.label] = drop
+        for t in outvoted(ranking, base, refused):
             after = self.bench.added(t, now).held_out
             drop = 100 * (
                 1 - after.balances[t.balance].ratio / now.held_out.balances[t.balance].ratio

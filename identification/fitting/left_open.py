@@ -151,7 +151,16 @@ class LeftOpen:
         for b, weight in ((b, w) for b, w in weights.items() if b in self.asked):
             others = [columns[o] * w[:, None] for o, w in weights.items() if o != b]
             lost = self._lost(len(runs), np.concatenate(others) if others else None)
-            problem = _Beside(every, start, lost, balances, records, values, b, weight)
+            problem = _Beside(
+                every,
+                start,
+                lost,
+                balances,
+                records,
+                values=values,
+                balance=b,
+                weight=weight,
+            )
             found = least_squares(
                 problem,
                 start,

@@ -29,7 +29,6 @@ from identification.balance.stacked import (
     rms,
     stack,
     support_of,
-    sure_levels,
     taking_part,
     unsure,
 )
@@ -344,13 +343,12 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
 
     A law that scales a measured torque passes its noise on with that scale: the residuals of two
     rivals are no lengths in one unit, and the one with the smaller unit is not the better one. What
-    even the best of them leaves beside noise is the same torque for all: as far as that noise is
-    certain, and what the turns leave is no part of it, as these have a scatter of their own. Rows
-    that may go either way by a law say little against it, and as much as others against one that
-    says which way.
+    even the best of them leaves beside noise is the same torque for all: what is more than noise
+    may be, whose squares are known to :data:`~identification.balance.colour.LEVEL_ERROR`. Rows that
+    may go either way by a law say little against it, and as much as others against one that says
+    which way.
     """
     levels = _believable(rivals, data)
-    left = [sure_levels(r.solution.model, data, r.solution.values) for r in rivals]
     either = [
         unsure(
             balances_of(r.solution.model, data.sensing, wrt=()), data, r.solution.values, data.train
@@ -362,8 +360,8 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
     for b in data.sensing.balances:
         rows = taking_part(b, data.train)
         beside = min(
-            max(0.0, sure[b] ** 2 - (1 + LEVEL_ERROR) * rms(level[b][rows]) ** 2)
-            for sure, level in zip(left, levels, strict=True)
+            max(0.0, r.solution.sigma[b] ** 2 - (1 + LEVEL_ERROR) * rms(level[b][rows]) ** 2)
+            for r, level in zip(rivals, levels, strict=True)
         )
         for weight, level, way in zip(out, levels, either, strict=True):
             variance = level[b] ** 2 + beside + way[b] ** 2
