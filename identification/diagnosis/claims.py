@@ -291,7 +291,7 @@ def outvoted(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Tria
         for t in ranking.everything
         if t.candidate.label not in refused
         and t.p_value <= sure
-        and t.gain <= GAIN
+        and t.gain <= GAIN < t.own_gain
         and t.effect.stage != "late"
         and not t.effect.is_delay
         and t.beyond_noise(t.cv_drop_percent) >= least_drop(t, base)

@@ -887,7 +887,7 @@ class Session:
         """
         title = standing.claims[position].effect.title
         for claim in standing.claims[position + 1 :]:
-            others = tuple(c for c in standing.claims if c is not claim)
+            others = tuple(c for c in standing.claims if c.label != claim.label)
             if (
                 claim.kernel is not None
                 or claim.effect.stage == "structure"

@@ -400,6 +400,8 @@ class Trial:
         with, RMS in sigmas of the base [1/N.m].
     error : float
         Standard error of that contribution, over blocks [N.m].
+    own_gain : float
+        The part of `gain` that is of the affected balance [nats].
     """
 
     candidate: Candidate
@@ -417,6 +419,7 @@ class Trial:
     unit: float = 1.0
     alone: float = 0.0
     error: float = math.inf
+    own_gain: float = 0.0
 
     def beyond_noise(self, drop_percent: float) -> float:
         """A fall of the RMS [%] in units of what noise alone leaves."""
@@ -578,6 +581,7 @@ def _score(
         candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
     )
     contribution = float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2)))
+    gains = _gains(base, sse1 / unit**2)
     beside = _beside_base(added, base, delta)
     alone, error = _visible(beside, delta[own:], base.balance == where, contribution)
     return Trial(
@@ -590,7 +594,8 @@ def _score(
         unit=float(unit[where]),
         alone=alone,
         error=error,
-        **{**told, "gain": _told(base, sse1 / unit**2)["gain"]},
+        own_gain=float(gains[where]),
+        **{**told, "gain": float(gains.sum())},
     )
 
 
@@ -640,15 +645,18 @@ def _noise_alone(model: JointModel, data: Dataset, values: Mapping[str, float]) 
     }
 
 
+def _gains(base: Base, sse1: FloatArray) -> FloatArray:
+    """Log-likelihood that each balance gains, (balances,) [nats]."""
+    before, after = (np.maximum(x.sum(axis=0), 1e-300) for x in (base.crossed, sse1))
+    effective = np.maximum(base.numbers.sum(axis=0), 1) * base.share
+    return np.asarray(effective / 2 * np.log(before / after))
+
+
 def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
     """What a trial says by the sum of squares that it leaves of each block and balance."""
     sse0, numbers = base.crossed, base.numbers
     per_balance0, per_balance1 = sse0.sum(axis=0), sse1.sum(axis=0)
     rows_in = np.maximum(numbers.sum(axis=0), 1)
-    effective = rows_in * base.share
-    gains = (
-        effective / 2 * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
-    )
     where = int(
         np.argmax(
             rows_in * np.log(np.maximum(per_balance0, 1e-300) / np.maximum(per_balance1, 1e-300))
@@ -658,7 +666,7 @@ def _told(base: Base, sse1: FloatArray) -> dict[str, Any]:
     drop = 100 * (1 - math.sqrt(per_balance1[where] / max(per_balance0[where], 1e-300)))
     return {
         "balance": base.balances[where],
-        "gain": float(gains.sum()),
+        "gain": float(_gains(base, sse1).sum()),
         "cv_drop_percent": drop,
         "block_score": ((sse0 - sse1) / (2 * variance) * base.share).sum(axis=1),
         "rms": np.sqrt(per_balance1 / rows_in),

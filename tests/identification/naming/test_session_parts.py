@@ -20,7 +20,7 @@ from casadi_models import EFFECTS, JointModel
 from identification.data.joint_file import Joint
 from identification.diagnosis.bench import Progress
 from identification.diagnosis.candidates import NotTestable, offered
-from identification.diagnosis.claims import LARGEST_SET, Claim, Ranking
+from identification.diagnosis.claims import LARGEST_SET, Claim, Ranking, outvoted
 from identification.diagnosis.curve import Curve
 from identification.diagnosis.improvement import Improvement, Step, made_worse
 from identification.diagnosis.learned import Doubt, Equivalence
@@ -62,6 +62,8 @@ class World:
         What its trial on the start model seems to explain, where that is something else.
     early : mapping of str to mapping
         The same beside one claim.
+    late_seen : mapping of str to mapping
+        The same beside more.
     falls : mapping of str to float
         Fall on held-out records that its linear trial seems to bring [%].
     unit : float
@@ -95,6 +97,7 @@ class World:
     explains: Mapping[str, Shares]
     first: Mapping[str, Shares] = field(default_factory=dict)
     early: Mapping[str, Shares] = field(default_factory=dict)
+    late_seen: Mapping[str, Shares] = field(default_factory=dict)
     falls: Mapping[str, float] = field(default_factory=dict)
     unit: float = 1.0
     rows: float = 100.0
@@ -176,7 +179,7 @@ class World:
         for key, c in every.items():
             if key not in self.explains or (key in self.late and not there):
                 continue
-            seems = (self.first, self.early, {})[min(len(there), 2)]
+            seems = (self.first, self.early, self.late_seen)[min(len(there), 2)]
             law = seems.get(key, self.explains[key])
             before, after = self.rms(*inside), self.rms(*inside, law)
             balance = max(before, key=lambda b: before[b] / after[b])
@@ -871,6 +874,65 @@ def test_a_name_that_spoils_held_out_records_takes_no_place(beside: bool, base: 
     assert claim.effects == ("cubic_viscous",)
     assert claim.confidence == pytest.approx({"cubic_viscous": 0.75} if beside else {})
     assert "held-out" in found.why("cyclic_torque")
+
+
+@pytest.mark.parametrize("all_of_it", [True, False])
+def test_what_was_claimed_beside_a_name_that_gave_way_is_asked_again(
+    all_of_it: bool, base: Base
+) -> None:
+    """A law that whole fits put in the place of another does the work of what came after it; what
+    it does not do stays.
+    """
+    whole = {"p": 1.0, "q": 1.0} | ({"r": 1.0} if all_of_it else {})
+    laws = {
+        "cubic_viscous": {"p": 1.0},
+        "quadratic_drag": {"q": 1.0},
+        "asymmetric_coulomb": {"r": 1.0},
+        "cyclic_torque": whole,
+    }
+
+    def odds(claim: Claim, now: Step) -> Odds:
+        first = claim.effects[0]
+        if first == "cubic_viscous":
+            return told(now, {"cyclic_torque": 1.0}, {"cubic_viscous@motor": "is far behind"})
+        return told(now, {first: 1.0}, {})
+
+    hidden = {"p": 60.0, "q": 12.0, "r": 6.0}
+    unseen = {"cyclic_torque": {"p": 0.01}}
+    world = World(base, hidden, laws, first=unseen, early=unseen, late_seen=unseen, chances=odds)
+    found = ended(world)
+    kept = [] if all_of_it else ["asymmetric_coulomb"]
+    assert named(found) == ["cyclic_torque", *kept]
+    assert "is not needed with" in found.why("quadratic_drag")
+
+
+@pytest.mark.parametrize(
+    ("own_gain", "gain", "cv_drop", "held_drop", "asked"),
+    [
+        (20.0, -90.0, 12.0, 22.0, True),
+        (20.0, 10.0, 12.0, 22.0, False),  # nothing is against it
+        (2.0, -90.0, 12.0, 22.0, False),  # its own balance is not sure of it
+        (20.0, -90.0, 8.0, 22.0, False),
+        (20.0, -90.0, 12.0, 4.0, False),
+        (20.0, -90.0, 12.0, math.nan, False),
+    ],
+)
+def test_only_laws_that_another_balance_is_against_are_outvoted(
+    own_gain: float, gain: float, cv_drop: float, held_drop: float, asked: bool, base: Base
+) -> None:
+    ranking = World(base, {"p": 24.0}, TWO).ranking(base)
+    (trial, *_) = ranking.everything
+    trial = replace(
+        trial,
+        own_gain=own_gain,
+        gain=gain,
+        cv_drop_percent=cv_drop,
+        held_out_drop_percent=held_drop,
+        p_value=1e-9,
+    )
+    ranking = replace(ranking, everything=(trial,), significant=frozenset())
+    assert outvoted(ranking, base, frozenset()) == ([trial] if asked else [])
+    assert outvoted(ranking, base, frozenset({trial.candidate.label})) == []
 
 
 def test_a_claim_that_is_less_probable_than_nothing_goes_and_the_others_stay(base: Base) -> None:
