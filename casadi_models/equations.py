@@ -321,9 +321,13 @@ class _Builder:
             return signals.torque
         asked = self.gravity(view)
         if self.model.load_from == "motion":
-            # the link's acceleration by the finer of two encoders, or the only one
+            # its own motion and friction: over a compliant gear it does not move as the motor does
             inertia = self.model.swinging_inertia(self.symbols.parameters)
-            asked = asked + inertia * signals.motor_acceleration
+            asked = asked + inertia * signals.link_acceleration
+            for t in self.model.terms:
+                law = t.effect
+                if t.place == "link" and law.family == "friction" and not law.needs_load:
+                    asked = asked + law.law(self.local(t, view), t.bound(self.symbols.parameters))
         return asked
 
     def levers(self, error: Expression) -> tuple[Expression, Expression]:
