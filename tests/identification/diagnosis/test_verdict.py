@@ -15,10 +15,12 @@ from casadi_models import EFFECTS
 from casadi_models.quantities import linear_unit
 from identification import Record, fit, improve, load_joint, read
 from identification.data.joint_file import Joint
+from identification.diagnosis.bench import JointBench
 from identification.diagnosis.candidates import offered
 from identification.diagnosis.claims import LARGEST_SET, rank, shortened
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.places import gather, places
+from identification.diagnosis.session import Session, with_held_out
 from identification.diagnosis.trials import make_base
 from identification.diagnosis.verdict import verdict_of
 from identification.errors import InputError
@@ -129,16 +131,18 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
 def test_rows_of_another_payload_stand_in_no_picture_of_the_link() -> None:
     loaded, held = record("loaded", 1, True, *SLOW), record("held out", 2, True, *SLOW)
     unloaded = replace(record("unloaded", 3, False, *FAST), payload="none")
-    found = improve([loaded, unloaded], JOINT, [held], max_additions=0)
+    found = fit(JOINT, [loaded, unloaded], held_out=[held])
     with_both = {
-        (p.balance, p.axis): p
-        for p in places(found.steps[0].solution, found.data, found.data.train)
+        (p.balance, p.axis): p for p in places(found.solution, found.data, found.data.train)
     }
     rows = sum(b.rows.sum() for b in with_both["link", "time"].branches)
     assert rows <= found.data.train[0].rows
     assert sum(b.rows.sum() for b in with_both["motor", "time"].branches) > found.data.train[0].rows
     assert len(gather(found.data, found.data.train).block) == sum(w.rows for w in found.data.train)
-    split = improve([loaded, unloaded], JOINT, max_additions=0)
+    train, apart, _ = with_held_out([loaded, unloaded], [])
+    data = load_dataset(train, apart, JOINT, prepared_model(JOINT, loaded))
+    session = Session(JointBench(JOINT, data, train, apart))
+    split = session.run(session.start(), 0)
     drawn = {(o.balance, o.record) for o in report_plots(split, [loaded, unloaded]).overlays}
     assert ("link", "loaded") in drawn
     assert ("link", "unloaded") not in drawn
