@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from identification import Record, fit, improve, load_joint, read
-from identification.balance.excitation import excitation_warnings
+from identification.balance.excitation import excitation_warnings, few_reversals
 from identification.data.check.quanta import quantum
 from identification.errors import InputError
 
@@ -47,8 +47,9 @@ def test_too_few_reversals_are_named_in_the_verdict() -> None:
         "where the held-out record confirms it"
     )
     assert any("reverses once only" in warning for warning in named.warnings)
-    rich = improve([whole], joint, [held])
-    assert not any("reverses" in warning for warning in (*rich.warnings, rich.reason))
+    rich = fit(joint, [whole], held_out=[held]).data
+    assert not few_reversals(rich), "nor does the verdict say so"
+    assert not any("reverses" in warning for warning in excitation_warnings(rich))
 
 
 def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
@@ -83,7 +84,7 @@ def test_record_in_degrees_beside_one_in_radians_is_refused() -> None:
         "degrees" in w for w in excitation_warnings(fit(joint, [degrees], held_out=[held]).data)
     ), "and said by what only fits"
     assert not any(
-        "degrees" in w for w in improve([train], joint, [held], max_additions=0).warnings
+        "degrees" in w for w in excitation_warnings(fit(joint, [train], held_out=[held]).data)
     )
 
 
@@ -105,4 +106,4 @@ def test_a_run_given_twice_under_two_names_is_refused() -> None:
         ):
             improve(given[0], joint, given[1])
     noisy = train.with_channel("motor_current", train["motor_current"] + 1e-9)
-    assert improve([train, replace(noisy, name="noisy")], joint, [held], max_additions=0).steps
+    assert len(fit(joint, [train, replace(noisy, name="noisy")], held_out=[held]).data.train) == 2

@@ -5,18 +5,23 @@ balances points to; linear axes.
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from casadi_models import EFFECTS
 from casadi_models.quantities import linear_unit
-from identification import Record, diagnose, fit, improve
+from identification import Record, fit, improve, load_joint, read
 from identification.data.joint_file import Joint
+from identification.diagnosis.bench import JointBench
 from identification.diagnosis.candidates import offered
-from identification.diagnosis.claims import LARGEST_SET, shortened
+from identification.diagnosis.claims import LARGEST_SET, rank, shortened
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.places import gather, places
+from identification.diagnosis.session import Session, with_held_out
+from identification.diagnosis.trials import make_base
 from identification.diagnosis.verdict import verdict_of
 from identification.errors import InputError
 from identification.fitting.engine import load_dataset, prepared_model
@@ -25,6 +30,7 @@ from workbench.show.first_page import next_html
 from workbench.show.fragments import pattern_of
 from workbench.show.plots import report_plots
 
+DEMO = Path(str(files("workbench"))) / "demo"
 SLOW = ((0.07, 0.11), (0.15, 0.10), 0.8)
 
 
@@ -42,8 +48,9 @@ def test_a_set_of_more_than_four_names_is_a_remainder_with_its_size() -> None:
 
 
 def test_names_that_are_not_significant_leave_a_set_that_is_too_large() -> None:
-    start = fit(JOINT, [record("loaded", 1, True, *SLOW)])
-    ranking = diagnose(start, [record("held out", 2, True, *SLOW)]).ranking
+    runs, held = ([record(n, k, True, *SLOW)] for k, n in ((1, "loaded"), (2, "held out")))
+    start = fit(JOINT, runs, held_out=held)
+    ranking = rank(make_base(start.solution, start.data))
     significant = [t.key for t in ranking.trials if t.candidate.label in ranking.significant]
     others = [t.key for t in ranking.trials if t.key not in significant]
     names = (significant[0], *others[:LARGEST_SET], significant[1])
@@ -54,7 +61,8 @@ def test_names_that_are_not_significant_leave_a_set_that_is_too_large() -> None:
 
 
 def test_a_claim_in_part_is_not_said_to_be_what_is_missing() -> None:
-    found = improve(record("loaded", 1, True, *SLOW), JOINT, [record("held out", 2, True, *SLOW)])
+    train, held = (read(DEMO / n) for n in ("train.npz", "held_out.npz"))
+    found = improve(train, load_joint(DEMO / "joint.toml"), [held])
     assert found.claims
     left = (Unexplained("motor", 40.0, axis="motor_velocity"),)
     args = (left, found.final_ratios, found.steps, None, "")
@@ -123,16 +131,18 @@ def test_a_linear_axis_has_no_laws_of_an_angle_and_units_of_its_own() -> None:
 def test_rows_of_another_payload_stand_in_no_picture_of_the_link() -> None:
     loaded, held = record("loaded", 1, True, *SLOW), record("held out", 2, True, *SLOW)
     unloaded = replace(record("unloaded", 3, False, *FAST), payload="none")
-    found = improve([loaded, unloaded], JOINT, [held], max_additions=0)
+    found = fit(JOINT, [loaded, unloaded], held_out=[held])
     with_both = {
-        (p.balance, p.axis): p
-        for p in places(found.steps[0].solution, found.data, found.data.train)
+        (p.balance, p.axis): p for p in places(found.solution, found.data, found.data.train)
     }
     rows = sum(b.rows.sum() for b in with_both["link", "time"].branches)
     assert rows <= found.data.train[0].rows
     assert sum(b.rows.sum() for b in with_both["motor", "time"].branches) > found.data.train[0].rows
     assert len(gather(found.data, found.data.train).block) == sum(w.rows for w in found.data.train)
-    split = improve([loaded, unloaded], JOINT, max_additions=0)
+    train, apart, _ = with_held_out([loaded, unloaded], [])
+    data = load_dataset(train, apart, JOINT, prepared_model(JOINT, loaded))
+    session = Session(JointBench(JOINT, data, train, apart))
+    split = session.run(session.start(), 0)
     drawn = {(o.balance, o.record) for o in report_plots(split, [loaded, unloaded]).overlays}
     assert ("link", "loaded") in drawn
     assert ("link", "unloaded") not in drawn

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
 from casadi_models import JointModel
-from identification import Joint, Record, compare, fit, improve, load_joint, read
+from identification import Improvement, Joint, Record, compare, fit, improve, load_joint, read
 from identification.balance.clocks import HALF_A_CYCLE
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.weak import WeakRecord
@@ -101,21 +103,31 @@ def test_a_drive_that_waits_and_is_filtered_is_shifted_by_its_wait(tmp_path: Pat
         assert late(w, "drive") == pytest.approx(1.458, abs=0.15)
 
 
+@cache
+def improved(seed: int, sensors: str) -> tuple[Improvement, Record, Record]:
+    """A joint of the recorded world as the loop leaves it, and its records."""
+    with TemporaryDirectory() as folder:
+        joint, train, test = recorded(seed, "single", Path(folder), sensors)
+    return improve([train], joint, [test]), train, test
+
+
 @pytest.mark.parametrize(
     ("seed", "sensors", "name"),
     [(201006, "encoders", "cyclic_friction"), (200002, "all", "kinematic_error")],
 )
-def test_clocks_are_asked_again_beside_what_is_missing(
-    seed: int, sensors: str, name: str, tmp_path: Path
-) -> None:
+def test_clocks_are_asked_again_beside_what_is_missing(seed: int, sensors: str, name: str) -> None:
     """The start model lacks a law of fifty and of a hundred and fifty times the noise, and its
     clocks lean to it: a second name, and 38 times the noise, came of that.
     """
-    joint, train, test = recorded(seed, "single", tmp_path, sensors)
-    found = improve([train], joint, [test])
+    found, *_ = improved(seed, sensors)
     assert [c.effects for c in found.claims] == [(name,)]
     assert found.verdict == "complete"
-    compared = compare(fit(joint, [train]), [test], linear=False)
+
+
+def test_a_comparison_has_the_clocks_that_the_loop_has() -> None:
+    """They are asked again beside what is missing there, too."""
+    found, train, test = improved(200002, "all")
+    compared = compare(fit(found.joint, [train]), [test], linear=False)
     assert found.steps[0].held_out.relative_error_percent == pytest.approx(
         compared.error.relative_error_percent, rel=1e-2
     )
