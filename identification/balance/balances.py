@@ -335,8 +335,10 @@ class Flight:
         return data.average(self._gap(count, data.table(_NAMES), memory, p).T)[:, 0]
 
 
-_KEPT: Final = 96
-"""Compiled balances that a thread keeps."""
+_KEPT: Final = 512
+"""Compiled balances that a thread keeps: a decision between four rivals asks for some 150, each
+several times; 512 take a few MB.
+"""
 
 _kept = threading.local()
 

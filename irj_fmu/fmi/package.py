@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import final
+from typing import Final, final
 from xml.etree import ElementTree
 
 from casadi_models.effect import EffectFile
@@ -288,10 +288,27 @@ pathlib.Path(out).write_bytes(to_bytes(made.to_xml({"guid": guid, "identifier": 
 """
 
 
+_described: Final[dict[str, bytes]] = {}
+"""By GUID, descriptions that this process has had written: `irj export all` packages the same
+estimator for itself and for the system, and a GUID stands for all that a slave is made of.
+"""
+_MOST_DESCRIBED: Final = 64
+
+
 def _describe(spec: SlaveSpec, resources: Mapping[str, bytes], guid: str) -> bytes:
     """Instantiate the slave in a fresh process, from the bundle alone, and return its
-    modelDescription.xml.
+    modelDescription.xml; the same bundle is tried once.
     """
+    if guid not in _described:
+        made = _instantiated(spec, resources, guid)
+        while len(_described) >= _MOST_DESCRIBED:
+            _described.pop(next(iter(_described)))
+        _described[guid] = made
+    return _described[guid]
+
+
+def _instantiated(spec: SlaveSpec, resources: Mapping[str, bytes], guid: str) -> bytes:
+    """What a fresh process writes of the slave."""
     with tempfile.TemporaryDirectory(prefix="irj-slave-") as temporary:
         folder = Path(temporary) / "resources"
         for name, code in resources.items():

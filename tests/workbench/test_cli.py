@@ -21,6 +21,7 @@ import pytest
 from casadi_models import EFFECTS, JointModel
 from identification import load_joint, read
 from identification.data.typical import true_values
+from tests.workbench.test_outputs import given
 from workbench.cli import files as outputs
 from workbench.cli import loop
 from workbench.cli.first.help import EXAMPLES
@@ -171,9 +172,7 @@ def test_report_keeps_a_part_of_the_record_back_and_says_so(
         main(
             [
                 "report",
-                str(DEMO / "train.npz"),
-                "--joint",
-                str(DEMO / "joint.toml"),
+                *given(tmp_path / "axis"),
                 "-o",
                 str(target),
                 "--json",

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from identification.data.guess import guess_columns
+from tests.workbench.test_report import swing
 from workbench.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,11 +48,29 @@ def test_compare_refuses_a_record_given_twice(capsys: pytest.CaptureFixture[str]
     assert "holds the same samples" in capsys.readouterr().err
 
 
-def test_a_report_follows_a_link_and_fills_a_pipe(tmp_path: Path) -> None:
+def given(folder: Path) -> list[str]:
+    """A record of a direct drive and its joint file, as arguments: where a report goes does not
+    depend on what is in it, and that of a geared joint takes three times as long.
+    """
+    folder.mkdir()
+    record = swing(1, "train")
+    np.savez(
+        folder / "run.npz",
+        time_s=record.time,
+        motor_torque_Nm=record["motor_torque"],
+        motor_position_rad=record["motor_position"],
+    )
+    (folder / "joint.toml").write_text('[joint]\nname = "axis"\neffects = ["viscous"]\n')
+    return [str(folder / "run.npz"), "--joint", str(folder / "joint.toml")]
+
+
+def test_a_report_follows_a_link_and_fills_a_pipe(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     link, target, pipe = tmp_path / "link.html", tmp_path / "target.html", tmp_path / "pipe"
     target.write_text("old")
     link.symlink_to(target)
-    command = ["report", str(DEMO / "train.npz"), "--joint", str(DEMO / "joint.toml"), "-o"]
+    command = ["report", *given(tmp_path_factory.mktemp("given") / "axis"), "-o"]
     assert main([*command, str(link)]) == 0
     assert link.is_symlink()
     assert target.read_text().lower().startswith("<!doctype html>")

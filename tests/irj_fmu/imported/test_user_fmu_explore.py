@@ -104,22 +104,24 @@ def test_a_variant_is_as_near_as_its_whole_fit(path: Path, hidden: str) -> None:
 
 
 def test_a_joint_of_one_side_is_explored(tmp_path: Path) -> None:
+    """From the command line: one search gives the report, the data and the file."""
     build("Axis", tmp_path, Make(3, CS)).replace(tmp_path / "axis.fmu")
     joint = tmp_path / "user.toml"
     joint.write_text(FILE.format(fmu="axis.fmu"))
     record = axis(lambda _q, w: 0.15 * w * abs(w), seconds=10.0, h=4e-3)
-    found = explore(load_user_joint(joint), record.window(0, 6), record.window(6, 10))
     for name, part in (("a", record.window(0, 6)), ("b", record.window(6, 10))):
         write_record(part, tmp_path / f"{name}.npz")
     given = [str(tmp_path / "a.npz"), "--held-out", str(tmp_path / "b.npz")]
-    report = tmp_path / "r.html"
-    assert main(["explore", *given, "--joint", str(joint), "--report", str(report)]) == 0
+    report, data, better = (tmp_path / n for n in ("r.html", "found.json", "better.toml"))
+    written = ["--report", str(report), "--json", str(data), "-o", str(better)]
+    assert main(["explore", *given, "--joint", str(joint), *written]) == 0
     assert "quadratic drag" in report.read_text(encoding="utf-8").lower()
-    labels = [v.added for v in found.found.ties]
-    assert any("quadratic_drag" in "".join(added) for added in labels)
-    assert any("quadratic_drag" in "".join(v.added) for v in found.found.front)
+    found = json.loads(data.read_text())
+    assert any("quadratic_drag" in "".join(labels) for labels in found["ties"])
+    assert any("quadratic_drag" in "".join(labels) for labels in found["pareto"])
+    model = load_user_joint(better)
     for name, value in TRUTH.items():
-        assert found.model.values[name] == pytest.approx(value, rel=0.05), name
+        assert model.values[name] == pytest.approx(value, rel=0.05), name
 
 
 # --- what it refuses ------------------------------------------------------------------------------

@@ -68,28 +68,33 @@ class Browser:
         return float(self.page.inner_text("#headline strong").split()[0])
 
 
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """One browser for the file: what a test leaves is in a context of its own."""
+    with launched() as running:
+        yield running
+
+
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
+def browser(chromium: Any) -> Iterator[Browser]:
     named = os.environ.get("IRJ_SCREENSHOTS")
     shots = Path(named) if named else None
     if shots is not None:
         shots.mkdir(parents=True, exist_ok=True)
-    with launched() as chromium:
-        context = context_of(
-            chromium, viewport={"width": 1280, "height": 860}, accept_downloads=True
-        )
-        problems: list[str] = []
-        context.on("weberror", lambda e: problems.append(str(e.error)))
-        context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
-        context.on(
-            "request",
-            lambda r: (
-                problems.append(f"network: {r.url}")
-                if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", r.url)
-                else None
-            ),
-        )
-        yield Browser(context.new_page(), shots, problems, context)
+    context = context_of(chromium, viewport={"width": 1280, "height": 860}, accept_downloads=True)
+    problems: list[str] = []
+    context.on("weberror", lambda e: problems.append(str(e.error)))
+    context.on("console", lambda m: problems.append(m.text) if m.type == "error" else None)
+    context.on(
+        "request",
+        lambda r: (
+            problems.append(f"network: {r.url}")
+            if not re.match(r"(http://127\.0\.0\.1:|data:|blob:)", r.url)
+            else None
+        ),
+    )
+    yield Browser(context.new_page(), shots, problems, context)
+    context.close()
     assert problems == []
 
 
@@ -354,7 +359,8 @@ def axe(page: Any, where: str, tags: list[str]) -> list[str]:
             "IRJ_AXE must name axe.min.js of the npm package axe-core"
         )
         return []
-    page.evaluate(Path(AXE).read_text(encoding="utf-8"))
+    if not page.evaluate("() => 'axe' in window"):  # it stays until the page is loaded anew
+        page.evaluate(Path(AXE).read_text(encoding="utf-8"))
     found = page.evaluate(
         "tags => axe.run(document, { resultTypes: ['violations'],"
         " ...(tags.length ? { runOnly: tags } : {}) })",
