@@ -272,10 +272,11 @@ class JointModel:
 
     @property
     def knows_load(self) -> bool:
-        """True where a term says what presses the gear's teeth without a torque sensor: a
-        torque of the link's position.
+        """True where the model says what presses the gear's teeth without a torque sensor: a
+        torque of the link's position, or the motion of a link that is measured.
         """
-        return any(t.place == "link" and t.effect.family == "torque" for t in self.terms)
+        moved = self.load_from == "motion" and not self.lagging_load
+        return moved or any(t.place == "link" and t.effect.family == "torque" for t in self.terms)
 
     @property
     def structure(self) -> tuple[object, ...]:

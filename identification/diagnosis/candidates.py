@@ -244,8 +244,8 @@ def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
         )
     if effect.needs_load and not data.sensing.has_torque and not model.knows_load:
         return (
-            "no torque sensor, and no gravity or other torque of the position in the model: "
-            "the load is not known"
+            "no torque sensor, no second encoder, and no gravity or other torque of the position "
+            "in the model: the load is not known"
         )
     there = _conditions(data)
     return next((r.why for r in effect.requires if not r.met(there)), "")
