@@ -329,6 +329,39 @@ def test_load_from_gravity_needs_no_torque() -> None:
     assert rate[1] == pytest.approx(-0.1 * 100 * math.sin(0.3) / 4.447, rel=1e-6)
 
 
+def test_load_from_the_motion_of_the_link_is_what_a_twisting_gear_carries() -> None:
+    """The link swings against the motor: what it asks for is the torque of the spring, with its
+    own friction, and no torque of the motor's acceleration.
+    """
+    values = {
+        **TABLE_4_3,
+        "gravity_torque": -105.18,
+        "link_viscous": 12.0,
+        "link_coulomb": 3.0,
+        "motor_load_friction": 0.1,
+        "motor_smoothing_velocity": 1e-3,
+        "link_smoothing_velocity": 1e-3,
+    }
+    model = JointModel.harmonic_drive(3).add("gravity").add("viscous@link").add("coulomb@link")
+    model = model.add("load_dependent_friction@motor").with_values(values)
+    seen = replace(model, load_from="motion")
+    assert seen.knows_load
+    assert not replace(seen, lagging_load=True).drop("gravity").knows_load
+    state = {"motor_position": 0.305, "motor_velocity": 0.5}
+    state |= {"link_position": 0.3, "link_velocity": 0.4}
+    rate = model.dynamics(list(state.values()), np.zeros(3), model.value_vector())
+    signals = dict.fromkeys(Signals.names(), 0.0) | state
+    signals |= {"motor_acceleration": float(rate[1]), "link_acceleration": float(rate[3])}
+    equations = seen.equations
+    law = ca.Function(
+        "law", [equations.signals.vector(), equations.parameters], [equations.motor_resistance]
+    )
+    carried = TABLE_4_3["stiffness"] * 5e-3
+    assert float(law(list(signals.values()), seen.value_vector())) == pytest.approx(
+        0.1 * carried, rel=1e-6
+    )
+
+
 @pytest.mark.parametrize("cubic", [0.0, 1.174e9])
 def test_sensor_compliance_is_a_spring_in_series(cubic: float) -> None:
     model = JointModel.harmonic_drive(3).add("cubic_stiffness").add("torque_sensor_compliance")
