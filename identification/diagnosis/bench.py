@@ -15,7 +15,6 @@ from casadi_models import JointModel
 from identification.balance.calibration import settled
 from identification.balance.colour import Part
 from identification.balance.dataset import without
-from identification.balance.memory import Law
 from identification.balance.sensing import Sensing
 from identification.balance.stacked import drifts_beside
 from identification.data.joint_file import Joint
@@ -189,7 +188,7 @@ class JointBench:
         self._start: Solution | None = None
         self._started = data.train
         self._base: Base | None = None
-        self._rankings: dict[tuple[Law, bool], Ranking] = {}
+        self._rankings: dict[bool, Ranking] = {}
         self._lines: dict[int, tuple[Solution, list[Line]]] = {}
 
     def start(self) -> Solution:
@@ -246,15 +245,14 @@ class JointBench:
     def ranking(
         self, base: Base, *, late: bool = False, progress: Progress | None = None
     ) -> Ranking:
-        """See :func:`identification.diagnosis.claims.rank`; made once per fitted model: the clocks
-        are set by that of the start model as well, and a fit may be asked about for several claims.
+        """See :func:`identification.diagnosis.claims.rank`; that of the start model, which the
+        clocks are set by as well, is made once.
         """
-        if base.data is not self.data:
+        if base is not self._base:
             return rank(base, late=late, progress=progress)
-        mark = (base.solution.law, late)
-        if mark not in self._rankings:
-            self._rankings[mark] = rank(base, late=late, progress=progress)
-        return self._rankings[mark]
+        if late not in self._rankings:
+            self._rankings[late] = rank(base, late=late, progress=progress)
+        return self._rankings[late]
 
     def tried(self, solution: Solution) -> list[str]:
         """Keys of the effects that the records can show beside the model."""

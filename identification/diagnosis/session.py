@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Final, final
 
@@ -249,7 +250,8 @@ class Session:
             raise InputError("no training record; give at least one")
         given, apart = gated(given, joint), gated(apart, joint)
         train, held, note = with_held_out(given, apart)
-        bench = timed_bench(joint, train, held, note=note)
+        bench = timed_bench(joint, train, held)
+        bench.data = replace(bench.data, note=note)
         return cls(bench, progress, gate_warnings([*given, *apart]))
 
     def start(self) -> Solution:
@@ -1243,7 +1245,6 @@ def timed_bench(
     *,
     kernel: float | None = None,
     like: Sensing | None = None,
-    note: str = "",
 ) -> JointBench:
     """A joint model with its records, their clocks set beside what is missing first.
 
@@ -1263,8 +1264,6 @@ def timed_bench(
         Checked (:func:`identification.data.check.gate.gated`).
     kernel, like
         See :func:`identification.balance.dataset.load_dataset`.
-    note : str
-        Of the data: what was held out of them.
 
     Raises
     ------
@@ -1272,17 +1271,7 @@ def timed_bench(
         Unusable records.
     """
     model = prepared_model(joint, train[0])
-
-    def ask(
-        *,
-        beside: tuple[Solution, Sequence[Mapping[str, float]]] | None = None,
-        alone: bool = False,
-    ) -> Dataset:
-        data = dataset_of(
-            train, held, joint, model, kernel=kernel, like=like, beside=beside, alone=alone
-        )
-        return replace(data, note=note)  # from the start: fits are known by their data
-
+    ask = partial(dataset_of, train, held, joint, model, kernel=kernel, like=like)
     bench = JointBench(joint, ask(), train, held, like=like)
     if not held:  # nothing is decided without held-out records
         return bench
