@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Final, final
 
 import numpy as np
@@ -26,7 +25,6 @@ from identification.balance.dataset import (
     weak_record,
 )
 from identification.balance.kinematic import held_scale
-from identification.balance.memory import Law, solution_of
 from identification.balance.noise import effective_share
 from identification.balance.stacked import (
     Stacked,
@@ -70,10 +68,6 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 
 
-def _items(values: Mapping[str, float | None]) -> tuple[tuple[str, float | None], ...]:
-    return tuple(values.items())
-
-
 @final
 @dataclass(frozen=True)
 class Solution:
@@ -109,16 +103,6 @@ class Solution:
     iterations: int = 0
     together: Correlation = Correlation()
 
-    @cached_property
-    def law(self) -> Law:
-        """What tells it from other fits to the same data."""
-        return Law(
-            self.model.structure,
-            *(_items(x) for x in (self.values, self.stderr, self.sigma)),
-            (self.free, self.at_bound, self.unidentified),
-            tuple((b, w.tobytes()) for b, w in self.weights.items()),
-        )
-
     def __repr__(self) -> str:
         return (
             f"Solution({len(self.free)} free parameters, at bound: {list(self.at_bound)}, not "
@@ -150,10 +134,7 @@ def solve(
     start: Mapping[str, float] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Solution:
-    """Fit a model to the training rows by Levenberg-Marquardt steps on the weak form; from memory
-    where the same model was fitted to the same data from the same values.
-
-    Names of a set are fitted again whenever another claim asks which of them it is.
+    """Fit a model to the training rows by Levenberg-Marquardt steps on the weak form.
 
     Parameters
     ----------
@@ -171,21 +152,9 @@ def solve(
     InputError
         An inertia or a stiffness that the channels would show, but not this motion.
     """
-    given = dict(start or {})
-    law = Law(model.structure, _items(model.values), _items(given), iterations)
-    return solution_of(data, law, lambda: _solved(model, data, iterations, given, progress))
-
-
-def _solved(
-    model: JointModel,
-    data: Dataset,
-    iterations: int,
-    start: Mapping[str, float],
-    progress: Callable[[str, float], None] | None,
-) -> Solution:
     if not model.lagging_load or LOAD_COMPLIANCE.name in data.joint.known:
-        return _fitted(model, data, iterations, start, progress)
-    tied = {**start, LOAD_COMPLIANCE.name: 0.0}
+        return _fitted(model, data, iterations, start or {}, progress)
+    tied = {**(start or {}), LOAD_COMPLIANCE.name: 0.0}
     # what hangs on the link loads the gear, however stiff it is
     loaded = any(t.effect.needs_load for t in model.terms)
     held = frozenset((LOAD_COMPLIANCE.name,) if loaded else HANGING)
@@ -193,7 +162,7 @@ def _solved(
     swinging = _swings(rigid, data)
     if swinging is None:
         return rigid
-    found = _fitted(model, data, iterations, start, progress)
+    found = _fitted(model, data, iterations, start or {}, progress)
     # a start far from the scale of the torques can end in no fit at all: then the rigid fit is
     # where to begin
     left = [_left(model, s.values, data) for s in (found, rigid)]
@@ -343,7 +312,7 @@ def stepped(
     iterations: int,
 ) -> tuple[Solution, float]:
     """A few steps of a fit, on the weighting of another one: models that are held against each
-    other need one weighting. From memory as :func:`solve`.
+    other need one weighting.
 
     Parameters
     ----------
@@ -360,17 +329,6 @@ def stepped(
     (Solution, float)
         Without standard errors; and the weighted sum of squares.
     """
-    law = Law("stepped", model.structure, _items(model.values), _items(start), like.law, iterations)
-    return solution_of(data, law, lambda: _stepped(model, data, start, like, iterations))
-
-
-def _stepped(
-    model: JointModel,
-    data: Dataset,
-    start: Mapping[str, float],
-    like: Solution,
-    iterations: int,
-) -> tuple[Solution, float]:
     held = frozenset(n for n in HANGING if n in like.values and n not in like.free)
     values, free, limits, _ = posed(model, data, start, held)
     balances = balances_of(model, data.sensing, wrt=bare(free))
@@ -397,11 +355,7 @@ def _stepped(
 
 
 def reweighed(solution: Solution, data: Dataset) -> Solution:
-    """A fit with the weights that belong to its own values; from memory as :func:`solve`."""
-    return solution_of(data, Law("reweighed", solution.law), lambda: _reweighed(solution, data))
-
-
-def _reweighed(solution: Solution, data: Dataset) -> Solution:
+    """A fit with the weights that belong to its own values."""
     sigma = _sigmas(solution.model, data, solution.values)
     balances = balances_of(solution.model, data.sensing, wrt=())
     weights = row_weights(balances, data, solution.values, sigma, data.train)
