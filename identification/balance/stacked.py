@@ -18,7 +18,7 @@ from identification.balance.calibration import bare, of_run, settled, values_on
 from identification.balance.colour import ChannelNoise, Part
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
-from identification.balance.memory import numbers_of
+from identification.balance.memory import Law, numbers_of
 from identification.balance.slow_noise import drift_of_rest
 from identification.balance.weak import WeakRecord, whole
 
@@ -420,12 +420,23 @@ def noise_believed(
     data: Dataset,
     values: Mapping[str, float],
     levels: Sequence[Mapping[str, float]] | None = None,
-) -> dict[str, float]:
+) -> Mapping[str, float]:
     """Share of the levels of noise of the training records (as drawn, or `levels`) that what these
     records leave allows, by balance: 1 where there is no contradiction.
     """
     if levels is None:
         levels = [drawn_floors(model, data, values, w) for w in data.train]
+    given = tuple(tuple(numbers.items()) for numbers in (values, *levels))
+    law = Law("believed", model.structure, given)
+    return numbers_of(data, law, lambda: _noise_believed(model, data, values, levels))
+
+
+def _noise_believed(
+    model: JointModel,
+    data: Dataset,
+    values: Mapping[str, float],
+    levels: Sequence[Mapping[str, float]],
+) -> dict[str, float]:
     residual = stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual
     either = unsure(balances_of(model, data.sensing, wrt=()), data, values, data.train)
     drifts, memory = drift_rows(model, data, values, data.train), drift_memory(data)
