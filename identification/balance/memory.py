@@ -22,6 +22,9 @@ MOST: Final = 4_000_000
 NUMBERS: Final = 2000
 """Single numbers that a thread keeps."""
 
+SOLUTIONS: Final = 100
+"""Fits that a thread keeps."""
+
 _kept = threading.local()
 
 
@@ -93,6 +96,22 @@ def numbers_of(
         return numbers, len(numbers)
 
     found: Mapping[str, float] = cache_of("numbers").get(record, law, made, NUMBERS)
+    return found
+
+
+def solution_of(data: Any, law: Hashable, make: Callable[[], T]) -> T:
+    """A fit to a dataset, from memory where the same one was asked for there.
+
+    Parameters
+    ----------
+    data : object
+        The dataset; held weakly, known by identity.
+    law : hashable
+        The model, and all that the fit starts from.
+    make : callable
+        Gives the fit.
+    """
+    found: T = cache_of("solutions").get(data, law, lambda: (make(), 1), SOLUTIONS)
     return found
 
 
@@ -169,4 +188,4 @@ def _array(kind: str, record: Any, law: Hashable, make: Callable[[], FloatArray]
     return found
 
 
-__all__ = ["Cache", "Law", "cache_of", "numbers_of", "residuals_of", "states_of"]
+__all__ = ["Cache", "Law", "cache_of", "numbers_of", "residuals_of", "solution_of", "states_of"]

@@ -15,7 +15,7 @@ from identification.diagnosis.candidates import Candidate, offered
 from identification.diagnosis.claims import HELD_OUT_DROP, MAJOR_DROP, Claim
 from identification.diagnosis.locate import BINS, Unexplained, axes, binned
 from identification.diagnosis.trials import Base, Trial, make_base, span_of, try_candidate
-from identification.fitting.engine import Dataset, Solution, solve, taking_part
+from identification.fitting.engine import Dataset, Solution, solved_once, taking_part
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def is_absorbed(claim: Claim, left: Unexplained, solution: Solution, data: Datas
     model = without(solution.model, claim.label)
     if left.axis is None or model.terms == solution.model.terms:
         return False
-    base = make_base(solve(model, data, start=solution.values), data)
+    base = make_base(solved_once(model, data, solution.values), data)
     candidate = _again(claim, base)
     if candidate is None:
         return False

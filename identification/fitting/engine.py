@@ -25,6 +25,7 @@ from identification.balance.dataset import (
     weak_record,
 )
 from identification.balance.kinematic import held_scale
+from identification.balance.memory import Law, solution_of
 from identification.balance.noise import effective_share
 from identification.balance.stacked import (
     Stacked,
@@ -60,12 +61,17 @@ __all__ = [
     "rms",
     "row_weights",
     "solve",
+    "solved_once",
     "stack",
     "stepped",
     "taking_part",
     "weak_record",
 ]
 FloatArray = npt.NDArray[np.float64]
+
+
+def _items(values: Mapping[str, float | None]) -> tuple[tuple[str, float | None], ...]:
+    return tuple(values.items())
 
 
 @final
@@ -102,6 +108,16 @@ class Solution:
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
     together: Correlation = Correlation()
+
+    @property
+    def law(self) -> Law:
+        """What tells it from other fits to the same data."""
+        return Law(
+            self.model.structure,
+            *(_items(x) for x in (self.values, self.stderr, self.sigma)),
+            (self.free, self.at_bound, self.unidentified),
+            tuple((b, w.tobytes()) for b, w in self.weights.items()),
+        )
 
     def __repr__(self) -> str:
         return (
@@ -167,6 +183,24 @@ def solve(
     # where to begin
     left = [_left(model, s.values, data) for s in (found, rigid)]
     return found if left[0] < left[1] else _fitted(model, data, iterations, swinging, progress)
+
+
+def solved_once(model: JointModel, data: Dataset, start: Mapping[str, float]) -> Solution:
+    """:func:`solve`, from memory where the same model was fitted to the same data from the same
+    values.
+
+    Names of a set are fitted again whenever another claim asks which of them it is.
+
+    Parameters
+    ----------
+    model : JointModel
+    data : Dataset
+        Known by identity.
+    start : mapping
+        Values to start from; the model's own where absent.
+    """
+    law = Law(model.structure, _items(model.values), _items(start))
+    return solution_of(data, law, lambda: solve(model, data, start=start))
 
 
 def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> float:
@@ -312,7 +346,7 @@ def stepped(
     iterations: int,
 ) -> tuple[Solution, float]:
     """A few steps of a fit, on the weighting of another one: models that are held against each
-    other need one weighting.
+    other need one weighting. From memory as :func:`solved_once`.
 
     Parameters
     ----------
@@ -329,6 +363,17 @@ def stepped(
     (Solution, float)
         Without standard errors; and the weighted sum of squares.
     """
+    law = Law("stepped", model.structure, _items(model.values), _items(start), like.law, iterations)
+    return solution_of(data, law, lambda: _stepped(model, data, start, like, iterations))
+
+
+def _stepped(
+    model: JointModel,
+    data: Dataset,
+    start: Mapping[str, float],
+    like: Solution,
+    iterations: int,
+) -> tuple[Solution, float]:
     held = frozenset(n for n in HANGING if n in like.values and n not in like.free)
     values, free, limits, _ = posed(model, data, start, held)
     balances = balances_of(model, data.sensing, wrt=bare(free))
@@ -355,7 +400,11 @@ def stepped(
 
 
 def reweighed(solution: Solution, data: Dataset) -> Solution:
-    """A fit with the weights that belong to its own values."""
+    """A fit with the weights that belong to its own values; from memory as :func:`solved_once`."""
+    return solution_of(data, Law("reweighed", solution.law), lambda: _reweighed(solution, data))
+
+
+def _reweighed(solution: Solution, data: Dataset) -> Solution:
     sigma = _sigmas(solution.model, data, solution.values)
     balances = balances_of(solution.model, data.sensing, wrt=())
     weights = row_weights(balances, data, solution.values, sigma, data.train)

@@ -35,7 +35,7 @@ from identification.balance.stacked import (
 from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered, shape_grid
 from identification.diagnosis.trials import Trial, make_base, try_candidate
-from identification.fitting.engine import Solution, reweighed, solve, stepped
+from identification.fitting.engine import Solution, reweighed, solved_once, stepped
 from identification.fitting.information import eliminated, form_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -100,7 +100,7 @@ def rivals_of(names: Sequence[str], balance: str, start: Solution, data: Dataset
         Rival(
             key,
             best[key].candidate.label,
-            solve(best[key].candidate.model, data, start={**start.values, **best[key].values}),
+            solved_once(best[key].candidate.model, data, {**start.values, **best[key].values}),
         )
         for key in names
         if key in best
@@ -138,7 +138,7 @@ def from_every_valley(rivals: Sequence[Rival], start: Solution, data: Dataset) -
                 tried.append((cost, found))
         if tried:
             best = min(tried, key=lambda t: t[0])[1]
-            whole = solve(candidate.model, data, start=best.values)
+            whole = solved_once(candidate.model, data, best.values)
             again = [replace(rival, solution=x) for x in (reweighed(best, data), whole)]
             rival = Contest([rival, *again], data).leader
         out.append(rival)

@@ -17,7 +17,15 @@ from identification.balance import balances as evaluated
 from identification.balance.balances import Balances
 from identification.data.joint_file import Known
 from identification.fitting.assess import assess
-from identification.fitting.engine import Dataset, load_dataset, prepared_model, solve
+from identification.fitting.engine import (
+    Dataset,
+    load_dataset,
+    prepared_model,
+    reweighed,
+    solve,
+    solved_once,
+    stepped,
+)
 from identification.fitting.first_fit import first_fit
 from tests.recorded_world._engine import library
 from tests.recorded_world.world import make_case, write_case
@@ -48,6 +56,33 @@ def test_the_fit_that_is_kept_is_the_one_that_would_be_made() -> None:
     anew = solve(model, data)
     assert anew.values == first.values
     assert anew.stderr == first.stderr
+
+
+def test_a_fit_is_made_once_of_the_same_data_and_the_same_start() -> None:
+    """Steps of a fit, and its weights, too; whatever else they hang on makes others of them."""
+    joint, train, held = demo()
+    data, model = prepared(joint, train, held), prepared_model(joint, train)
+    found = solved_once(model, data, {})
+    assert solved_once(model, data, dict(model.values)).values == found.values
+    assert solved_once(model, data, {}) is found
+    name = model.inertias[0]
+    start = {name: 2 * found.values[name]}
+    others = [
+        solved_once(model, data, start),
+        solved_once(model, replace(data), {}),  # other data, of the same rows
+        solved_once(model.with_values(start), data, {}),
+        solved_once(model.drop("gravity"), data, {}),
+    ]
+    assert not any(other is found for other in others)
+    steps, cost = stepped(model, data, start, found, iterations=2)
+    assert stepped(model, data, dict(start), found, iterations=2)[0] is steps
+    louder = replace(found, weights={b: 2 * w for b, w in found.weights.items()})
+    assert stepped(model, data, start, louder, iterations=2)[1] > 2 * cost
+    assert stepped(model, data, start, found, iterations=1)[0] is not steps
+    assert reweighed(louder, data) is reweighed(replace(louder), data)
+    moved = replace(found, values={**found.values, **start})
+    one, other = (reweighed(fit, data).weights for fit in (louder, moved))
+    assert any(not np.array_equal(one[b], other[b]) for b in one)
 
 
 def test_another_model_another_knowledge_and_other_rows_are_fitted_anew() -> None:
