@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel, hold
 from casadi_models.term import SIDE_INERTIAS
-from identification.balance.calibration import named_late, unknowns_of
+from identification.balance.calibration import named_late, of_run, start_values, unknowns_of
 from identification.balance.clocks import (
     SIGNAL,
     as_told,
@@ -247,7 +247,7 @@ def load_dataset(
         sensing,
         train=tuple(prepared[:count]),
         held_out=tuple(prepared[count:]),
-        ranges=_ranges(prepared[:count], model.clamped_link),
+        ranges=_ranges(prepared[:count], model, torque=sensing.has_torque),
         noise=noise,
         train_names=tuple(r.name for r in train),
         held_out_names=tuple(r.name for r in held_out),
@@ -594,16 +594,29 @@ def torsion_kernel(
     return longest
 
 
-def _ranges(data: Sequence[WeakRecord], clamped: bool) -> dict[str, float]:
+def _ranges(data: Sequence[WeakRecord], model: JointModel, *, torque: bool) -> dict[str, float]:
+    """See :class:`Dataset`. A torsion counts from where the twist begins, and not from where its
+    encoders read the same: a kink of the stiffness that is looked for up to an encoder's zero is
+    looked for where no twist is.
+    """
+
     def span(values: FloatArray) -> float:
         return float(np.quantile(np.abs(values), 0.99)) or 1e-12
 
     speed = np.concatenate([w.smooth["motor_velocity"] for w in data])
     q = np.concatenate([w.smooth["motor_position"] for w in data])
+    zeros = start_values(model, data, torque=torque)
     twist = (
         q
-        if clamped
-        else np.concatenate([w.smooth["motor_position"] - w.smooth["link_position"] for w in data])
+        if model.clamped_link
+        else np.concatenate(
+            [
+                w.smooth["motor_position"]
+                - w.smooth["link_position"]
+                + zeros.get(of_run("link_encoder_zero", w), 0.0)
+                for w in data
+            ]
+        )
     )
     duration = sum(float(np.ptp(w.time)) for w in data)
     return {

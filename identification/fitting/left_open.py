@@ -4,8 +4,10 @@ A motion at one speed tells the sum of viscous and Coulomb friction well and eac
 On a record at other speeds the right model then stands far over the noise, and nothing is missing.
 With noise of unit variance in the rows, and the parameters known as the training rows tell them,
 the squared length of a residual r in its covariance I + J P J' is the least of
-|r + J d|^2 + |R d|^2 over the steps d of the parameters, R'R = P^-1 (Kalman's update of a value by
-what comes later; the innovations of Mehra 1970). Steps stay inside the bounds of the parameters.
+|r + J d|^2 + |T d|^2 over the steps d of the parameters, T the Jacobian of the training rows,
+T'T = P^-1 (Kalman's update of a value by what comes later; the innovations of Mehra 1970). Both are
+followed as far as the step goes: the valley that the training rows leave is bent where a gap trades
+with the zeros of the encoders. Steps stay inside the bounds of the parameters.
 
 Zeros and clocks of the other records are their own and were fitted to them at the values of the
 fit; they move along: a gap that no training row crosses is open by as much as the zero of an
@@ -15,14 +17,14 @@ encoder that its flank stands for. What the other balances of these records lose
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.balances import Balances, balances_of
+from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, limits_of_runs, names_of_runs
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import floor_rows, row_weights, stack
@@ -67,24 +69,21 @@ class LeftOpen:
 
     Attributes
     ----------
-    solution : Solution
+    names : tuple of str
+        The free parameters of the fit, which other records share.
     asked : frozenset of str
         Balances that are asked for a step.
-    names : tuple of str
-        Its free parameters that other records share.
-    triangle : (p, p) array
-        R of their rows: each of unit variance by noise alone, whatever the model leaves of them.
-    limits : two (p,) arrays
-    logarithmic : (p,) bool array
-        Scales, which move by factors.
+    here : WeakForm
+        The training rows over zeros and clocks of their runs, and over `names`: each of unit
+        variance by noise alone, whatever the model leaves of them.
+    limits : mapping of str to (low, high)
+        Of `names`.
     """
 
-    solution: Solution
-    asked: frozenset[str]
     names: tuple[str, ...]
-    triangle: FloatArray
-    limits: tuple[FloatArray, FloatArray]
-    logarithmic: npt.NDArray[np.bool_]
+    asked: frozenset[str]
+    here: WeakForm
+    limits: Mapping[str, tuple[float, float]]
 
     @classmethod
     def of(
@@ -96,7 +95,6 @@ class LeftOpen:
     ) -> LeftOpen:
         """Of a fit, `values` those of it and of the runs."""
         model, sensing = solution.model, data.sensing
-        runs = names_of_runs(model, data.train)
         names = solution.free  # what stands at a bound may leave it on one side
         floor = floor_rows(model, data, values, data.train)
         weights = row_weights(
@@ -106,17 +104,10 @@ class LeftOpen:
             {b: np.maximum(x, 1e-12) for b, x in floor.items()},
             data.train,
         )
-        every = (*runs, *names)
-        problem = WeakForm(
-            balances_of(model, sensing, wrt=bare(every)), data, values, every, weights
-        )
-        rows = problem.jacobian(np.array([values[n] for n in every]))
-        # what only the run has is taken out: other records have their own
-        triangle = triangle_of(rows)[len(runs) :, len(runs) :]
+        every = (*names_of_runs(model, data.train), *names)
+        balances = balances_of(model, sensing, wrt=bare(every))
         limits = bounds_of(model, data.joint.known, data)
-        low, high = (np.array([limits[n][i] for n in names]) for i in (0, 1))
-        logarithmic = problem.logarithmic[len(runs) :]
-        return cls(solution, asked, names, triangle, (low, high), logarithmic)
+        return cls(names, asked, WeakForm(balances, data, values, every, weights), limits)
 
     def steps(
         self,
@@ -135,101 +126,118 @@ class LeftOpen:
         weights : mapping of str to (rows,) array
             1/deviation of each row by noise.
         """
-        model = self.solution.model
+        model = self.here.balances.model
         runs = names_of_runs(model, records)
         every = (*runs, *self.names)
         balances = balances_of(model, data.sensing, wrt=bare(every))
-        of_runs = limits_of_runs(model, records)
-        limits = tuple(
-            np.concatenate([[of_runs[n][i] for n in runs], side])
-            for i, side in enumerate(self.limits)
-        )
-        logarithmic = np.concatenate([np.zeros(len(runs), dtype=bool), self.logarithmic])
-        start = np.array([values[n] for n in every])
-        columns = stack(balances, records, values, every).jacobian
+        there = WeakForm(balances, replace(data, train=tuple(records)), values, every, weights)
+        limits = {
+            **limits_of_runs(model, [*self.here.data.train, *records]),
+            **{n: self.limits[n] for n in self.names},
+        }
+        columns = stack(balances, records, values, runs).jacobian
         out = {}
-        for b, weight in ((b, w) for b, w in weights.items() if b in self.asked):
+        for b in (b for b in weights if b in self.asked):
             others = [columns[o] * w[:, None] for o, w in weights.items() if o != b]
-            lost = self._lost(len(runs), np.concatenate(others) if others else None)
-            problem = _Beside(
-                every,
-                start,
-                lost,
-                balances,
-                records,
-                values=values,
-                balance=b,
-                weight=weight,
-            )
+            own = triangle_of(np.concatenate(others)) if others else np.zeros((0, len(runs)))
+            problem = _Beside(self.here, there, b, own)
+            names = problem.names
+            start = problem.start
             found = least_squares(
                 problem,
                 start,
-                (limits[0], limits[1]),
-                logarithmic=logarithmic,
+                ([limits[n][0] for n in names], [limits[n][1] for n in names]),
+                logarithmic=problem.logarithmic,
                 iterations=ITERATIONS,
                 tolerance=ENOUGH,
             ).x
-            step = found - start
-            moved = problem.jacobian(found)[: len(weight)] * step
+            moved = problem.columns(found)[:, : len(every)] * (found - start)[: len(every)]
             each = np.linalg.norm(moved[:, len(runs) :], axis=0)
             leading = each > LEADING * each.max(initial=0.0)
             out[b] = Step(
                 problem.left(found) - problem.left(start),
-                float(np.sum((lost @ step) ** 2)),
+                float(np.sum(problem.lost(found) ** 2)),
                 tuple(n for n, x in zip(self.names, leading, strict=True) if x),
             )
         return out
-
-    def _lost(self, runs: int, others: FloatArray | None) -> FloatArray:
-        """What a step loses elsewhere: that of the runs in the other balances of their records,
-        that of the rest in the training rows.
-        """
-        count = len(self.names)
-        own = np.zeros((runs, runs)) if others is None else triangle_of(others[:, :runs])
-        return np.block(
-            [
-                [own, np.zeros((len(own), count))],
-                [np.zeros((len(self.triangle), runs)), self.triangle],
-            ]
-        )
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class _Beside:
-    """Rows of one balance of other records, and what is lost elsewhere; a
+    """Rows of one balance of other records, and what is lost elsewhere by the step: that of their
+    runs in their other balances, that of the rest in the training rows; a
     :class:`identification.fitting.least_squares.Problem`.
+
+    Attributes
+    ----------
+    here, there : WeakForm
+        Training rows, and those of the other records.
+    balance : str
+    own : (rows, runs) array
+        What the other balances of the other records lose.
     """
 
-    names: tuple[str, ...]
-    start: FloatArray
-    lost: FloatArray
-    balances: Balances
-    records: Sequence[WeakRecord]
-    values: Mapping[str, float]
+    here: WeakForm
+    there: WeakForm
     balance: str
-    weight: FloatArray
-
-    def _at(self, x: FloatArray) -> Mapping[str, float]:
-        return {**self.values, **dict(zip(self.names, x.tolist(), strict=True))}
+    own: FloatArray
 
     @cached_property
-    def _bare(self) -> Balances:
-        return balances_of(self.balances.model, self.balances.sensing, wrt=())
+    def names(self) -> tuple[str, ...]:
+        """Of the other runs, of all records, of the training runs."""
+        return (*self.there.free, *(n for n in self.here.free if n not in self.there.free))
+
+    @cached_property
+    def start(self) -> FloatArray:
+        """Values of the fit, (unknowns,)."""
+        return np.array([{**self.here.values, **self.there.values}[n] for n in self.names])
+
+    @cached_property
+    def logarithmic(self) -> npt.NDArray[np.bool_]:
+        """Scales, which move by factors, (unknowns,)."""
+        scales = {n for f in (self.here, self.there) for n, x in zip(f.free, f.logarithmic) if x}
+        return np.array([n in scales for n in self.names])
+
+    @cached_property
+    def _taken(self) -> list[int]:
+        """Places of the unknowns of the training rows."""
+        return [self.names.index(n) for n in self.here.free]
+
+    @cached_property
+    def _before(self) -> FloatArray:
+        return self.here.residual(self.start[self._taken])
 
     def left(self, x: FloatArray) -> FloatArray:
         """Residual of the balance, (rows,)."""
-        return np.asarray(stack(self._bare, self.records, self._at(x)).residual[self.balance])
+        values = self.there.at(x[: len(self.there.free)])
+        bare_ = balances_of(self.there.balances.model, self.there.data.sensing, wrt=())
+        return np.asarray(stack(bare_, self.there.data.train, values).residual[self.balance])
+
+    def columns(self, x: FloatArray) -> FloatArray:
+        """Its weighted derivative, (rows, unknowns)."""
+        found = self.there.stacked(x[: len(self.there.free)]).jacobian[self.balance]
+        out = np.zeros((len(found), len(self.names)))
+        out[:, : found.shape[1]] = found * np.atleast_1d(self.there.weights[self.balance])[:, None]
+        return out
+
+    def lost(self, x: FloatArray) -> FloatArray:
+        """What is lost elsewhere, (rows,)."""
+        step = (x - self.start)[: self.own.shape[1]]
+        return np.concatenate([self.own @ step, self.here.residual(x[self._taken]) - self._before])
 
     def residual(self, x: FloatArray) -> FloatArray:
-        """Weighted rows, and what is lost elsewhere, (rows + p,)."""
-        return np.concatenate([self.left(x) * self.weight, self.lost @ (x - self.start)])
+        """Weighted rows, and what is lost elsewhere."""
+        return np.concatenate([self.left(x) * self.there.weights[self.balance], self.lost(x)])
 
     def jacobian(self, x: FloatArray) -> FloatArray:
-        """Their derivative, (rows + p, p)."""
-        found = stack(self.balances, self.records, self._at(x), self.names)
-        columns = found.jacobian[self.balance] * self.weight[:, None]
-        return np.concatenate([columns, self.lost])
+        """Their derivative."""
+        own = np.zeros((len(self.own), len(self.names)))
+        own[:, : self.own.shape[1]] = self.own
+        rows = self.here.jacobian(x[self._taken])
+        lost = np.zeros((len(rows), len(self.names)))
+        lost[:, self._taken] = rows
+        return np.concatenate([self.columns(x), own, lost])
 
 
 __all__ = ["LeftOpen", "Step"]

@@ -77,6 +77,20 @@ def test_the_zero_is_said_with_its_band_and_is_no_parameter_and_no_effect() -> N
 
 
 @pytest.mark.parametrize("torque_sensor", [True, False])
+def test_how_far_the_gear_twists_does_not_hang_on_where_the_encoders_have_their_zero(
+    torque_sensor: bool,
+) -> None:
+    """Knots of a stiffness are looked for along it: up to the zero there would be no twist."""
+    plain = [record(f"run {i}", 3 + i, False, *FAST) for i in range(2)]
+    if not torque_sensor:
+        plain = [r.without("link_torque") for r in plain]
+    model = prepared_model(JOINT, plain[0])
+    off = [moved(r, z) for r, z in zip(plain, (5e-2, -2e-2), strict=True)]
+    before, after = (load_dataset(runs, [], JOINT, model).ranges for runs in (plain, off))
+    assert after == pytest.approx(before, rel=1e-6)
+
+
+@pytest.mark.parametrize("torque_sensor", [True, False])
 def test_every_run_has_its_own_zero(torque_sensor: bool) -> None:
     zeros = (1e-3, -3e-3)
     plain = [record(f"run {i}", 3 + i, False, *FAST) for i in range(2)]

@@ -54,8 +54,8 @@ def test_the_right_model_stands_at_its_noise(drawn: np.ndarray) -> None:
 
 
 def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
-    """The triangle is that of the training rows: a step of one parameter by its standard error
-    beside all others costs one variance.
+    """It is that of the training rows: a step of one parameter by its standard error beside all
+    others costs one variance.
     """
     rng = np.random.default_rng(5)
     train = record(rng, 10.0, nothing).renamed("train")
@@ -64,7 +64,9 @@ def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
     found = solve(model, data)
     values = settled(model, data.sensing, data.train, found.values)
     left_open = LeftOpen.of(found, data, values, frozenset({"axis"}))
-    inverse = np.linalg.inv(left_open.triangle)
+    assert left_open.here.free == left_open.names, "one encoder: nothing is a run's own"
+    rows = left_open.here.jacobian(np.array([values[n] for n in left_open.names]))
+    inverse = np.linalg.inv(np.linalg.qr(rows, mode="r"))
     errors = np.linalg.norm(inverse, axis=1)
     stated = np.array([found.stderr[n] or np.nan for n in left_open.names])
     # rows overlap: windows of time tell the errors, and rows that are taken as independent less
