@@ -74,6 +74,10 @@ class Parameter:
     added : bool
         The effect was once without it: a joint file with fitted values of the effect's others but
         not of this one has it at its start.
+    in_place_of : str
+        Signal (of :class:`LocalSignals`) that is not always recorded: the parameter shapes what
+        stands in for it. Where the signal is recorded there is nothing to shape, and the parameter
+        keeps its start.
     """
 
     name: str
@@ -88,6 +92,7 @@ class Parameter:
     role: Role = ""
     typical: Typical = field(default=None, hash=False)
     added: bool = False
+    in_place_of: str = ""
 
     def __post_init__(self) -> None:
         if not self.low <= self.start <= self.high:
@@ -169,6 +174,7 @@ def shape(
     role: Role = "",
     typical: Typical = None,
     added: bool = False,
+    in_place_of: str = "",
 ) -> Parameter:
     """A shape parameter: enters nonlinearly, searched on a grid of fractions of a signal's
     range.
@@ -185,4 +191,5 @@ def shape(
         role=role,
         typical=typical,
         added=added,
+        in_place_of=in_place_of,
     )

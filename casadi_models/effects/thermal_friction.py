@@ -4,9 +4,14 @@ training record).
 
 from types import SimpleNamespace
 
+import casadi as ca
+
 from ..effect import effect
-from ..parameter import signed
+from ..parameter import shape, signed
 from ..signals import Expression, LocalSignals
+
+NEARLY_WARM = 1e-12
+"""Least of the warm-up that is left: its logarithm stays finite."""
 
 
 @effect(
@@ -21,6 +26,20 @@ from ..signals import Expression, LocalSignals
         signed(
             "thermal_viscous", "N.m.s/(rad.K)", "change of the viscous coefficient with temperature"
         ),
+        shape(
+            "thermal_pace",
+            "1",
+            "how many times as fast as over a third of the longest run the joint warms up, where "
+            "no temperature is recorded",
+            (0.25, 0.5, 1.0, 2.0, 4.0),
+            "absolute",
+            start=1.0,
+            low=0.1,
+            high=10.0,
+            typical=1.0,
+            added=True,
+            in_place_of="temperature",
+        ),
     ),
     absence="the friction residual changes during the run while its shape stays",
     excitation="a long run that repeats its first block at the end, with temperature recorded; "
@@ -31,4 +50,10 @@ from ..signals import Expression, LocalSignals
 )
 def thermal_friction(s: LocalSignals, p: SimpleNamespace) -> Expression:
     """Change of friction with the temperature above the origin."""
-    return (p.thermal_coulomb * s.direction + p.thermal_viscous * s.velocity) * s.temperature
+    left = 1 - s.temperature
+    # what is left at another pace is its power; written so that a pace of 1 is the temperature
+    # itself, to the last bit and on either side of 1
+    faster = 1 - ca.exp((p.thermal_pace - 1) * ca.log(ca.fmax(ca.fabs(left), NEARLY_WARM)))
+    return (p.thermal_coulomb * s.direction + p.thermal_viscous * s.velocity) * (
+        s.temperature + left * faster
+    )

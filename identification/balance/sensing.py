@@ -70,6 +70,11 @@ class Sensing:
         return self.balances == ("axis",) or self.clamped_link
 
     @property
+    def recorded(self) -> frozenset[str]:
+        """Signals that are recorded, of those for which something else can stand in."""
+        return frozenset({"temperature"} if self.has_temperature else ())
+
+    @property
     def motor_and_torque(self) -> bool:
         """True where drive, motor and torque are recorded, and the link is not."""
         return self.has_torque and self.balances == ("motor",)
@@ -333,6 +338,13 @@ def adapt(
         load_from="torque" if sensing.has_torque and not sensing.clamped_link else "gravity",
         clamped_link=sensing.clamped_link or direct,
     )
+
+
+def settled(model: JointModel, sensing: Sensing) -> dict[str, float]:
+    """Parameters that shape what stands in for a signal, where that signal is recorded: they have
+    nothing to shape and keep their start.
+    """
+    return {p.name: p.start for p in model.parameters if p.in_place_of in sensing.recorded}
 
 
 def drive_torque(record: Record, joint: Joint) -> FloatArray:

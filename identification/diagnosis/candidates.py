@@ -15,7 +15,7 @@ import numpy as np
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.effect import ANYTHING_KNOWN, SECOND_BALANCE, TORQUE_SENSOR, Place
 from identification.balance.dataset import HOLD_DELAY, Dataset, with_effect
-from identification.balance.sensing import Sensing
+from identification.balance.sensing import Sensing, settled
 
 WARM_UP: Final = 15.0
 """Shortest run in which a warm-up is looked for without a temperature channel [s]."""
@@ -188,7 +188,7 @@ def offered(
                 and place != "transmission"
             ):
                 continue
-            out.extend(_placed(effect, place, model))
+            out.extend(_placed(effect, place, model, sensing))
     return out, refused
 
 
@@ -271,7 +271,7 @@ def _conditions(data: Dataset) -> frozenset[str]:
     return frozenset(data.joint.known) | {name for name, there in recorded.items() if there}
 
 
-def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
+def _placed(effect: Effect, place: Place, model: JointModel, sensing: Sensing) -> list[Candidate]:
     label = f"{effect.key}@{place}" if len(effect.acts_on) > 1 else effect.key
     there = sum(
         t.effect.key == effect.key and t.place == place and t.label != HOLD_DELAY
@@ -290,7 +290,10 @@ def _placed(effect: Effect, place: Place, model: JointModel) -> list[Candidate]:
     for variant in variants:
         bigger = with_effect(variant, label)
         term = next(t for t in bigger.terms if t.label == label)
-        pairs = list(zip(term.names, effect.parameters, strict=True))
+        kept = settled(bigger, sensing)
+        pairs = [
+            (n, p) for n, p in zip(term.names, effect.parameters, strict=True) if n not in kept
+        ]
         out.append(
             Candidate(
                 label,

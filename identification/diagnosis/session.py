@@ -1196,7 +1196,7 @@ class Session:
         return (
             "no temperature was recorded: thermal friction is judged by the time since each run "
             "started, taken as a cold start; "
-            "its values are the change over one run, not per kelvin",
+            "its values are the change from cold to warm, not per kelvin",
         )
 
     def _partial(

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 from identification.balance.dataset import HOLD_NAME
+from identification.balance.sensing import settled
 from identification.fitting.engine import Dataset, Solution
 
 
@@ -21,8 +22,9 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
         and cosine pairs also as amplitude and phase; stderr None where it does not apply.
     """
     out: dict[str, dict[str, Any]] = {}
+    apart = {HOLD_NAME, *solution.model.calibration, *settled(solution.model, data.sensing)}
     for p in solution.model.parameters:
-        if p.name == HOLD_NAME or p.name in solution.model.calibration:
+        if p.name in apart:
             continue
         nuisance = p.role == "smoothing"
         partner = solution.correlation.get(p.name)
@@ -41,7 +43,6 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
         named = dict(zip((p.name for p in term.effect.parameters), term.names, strict=True))
         for name, sine, cosine in term.effect.pairs:
             out.update(_polar(*term.affixes(name), out[named[sine]], out[named[cosine]]))
-    del data
     return out
 
 

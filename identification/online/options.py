@@ -104,7 +104,8 @@ def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]
 
 
 def held_parameters(joint: Joint) -> frozenset[str]:
-    """Parameters the estimator leaves alone: known ones, delays, and kinematic errors.
+    """Parameters the estimator leaves alone: known ones, delays, kinematic errors, and what shapes
+    a stand-in for a signal: it has neither.
 
     A kinematic error multiplies the stiffness, so that one of the two must be held; it is the
     geometry.
@@ -112,7 +113,9 @@ def held_parameters(joint: Joint) -> frozenset[str]:
     model = joint.model()
     delays = frozenset(model.named("delay"))
     geometry = {n for t in model.terms if t.place == "torsion" for n in t.names}
-    return frozenset(k for k, v in joint.known.items() if v.value is not None) | delays | geometry
+    known = {k for k, v in joint.known.items() if v.value is not None}
+    stand_ins = {p.name for p in model.parameters if p.in_place_of}
+    return frozenset(known | geometry | stand_ins) | delays
 
 
 def searched_parameters(joint: Joint, options: OnlineOptions | None = None) -> tuple[str, ...]:

@@ -71,8 +71,9 @@ LIBRARY: dict[str, tuple[str, dict[str, str]]] = {
     ),
     "structural_damping": ("d*twist_rate", {"d": "0..90 N.m.s/rad"}),
     "thermal_friction": (
-        "(c*direction + d*v)*temperature",
-        {"c": "-1..1 N.m/K", "d": "-1..1 N.m.s/(rad.K)"},
+        "(c*direction + d*v)*(temperature + (u - temperature)"
+        "*(1 - exp((k - 1)*log(max(abs(1 - temperature/u), 1e-12)))))",
+        {"c": "-1..1 N.m/K", "d": "-1..1 N.m.s/(rad.K)", "k": "0.1..10", "u": "0.1..10 K"},
     ),
     "torque_ripple": (
         "s*sin(n*motor_angle) + c*cos(n*motor_angle)",
@@ -101,7 +102,7 @@ LIBRARY: dict[str, tuple[str, dict[str, str]]] = {
 """Each memoryless law of the library as one would type it; parameters in the order of the
 declaration.
 """
-STATED = {"load_dependent_friction": {"e": 1e-3}}
+STATED = {"load_dependent_friction": {"e": 1e-3}, "thermal_friction": {"u": 1.0}}
 """Numbers with a unit inside a law of the library: a parameter of the typed one."""
 
 

@@ -12,6 +12,7 @@ from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
+from identification.balance.sensing import settled
 from identification.fitting.engine import Dataset, Solution
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.weak_form import WeakForm
@@ -41,15 +42,15 @@ def first_look(
     known = data.joint.known
     values = starts(model, data)
     values.update({k: float(v) for k, v in start.items() if k in values})
-    values.update({n: k.value for n, k in known.items() if k.value is not None and n in values})
+    fixed = {n: k.value for n, k in known.items() if k.value is not None}
+    fixed |= settled(model, data.sensing)
+    values.update({n: v for n, v in fixed.items() if n in values})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape} - set(now.free)
-    fixed = {n for n, k in known.items() if k.value is not None}
+    apart = {*fixed, *shapes, *model.calibration}
     if now.values.get(LOAD_COMPLIANCE.name) == 0.0:
-        fixed |= set(HANGING)
-    free = [
-        n for n in model.parameter_names if n not in fixed | shapes and n not in model.calibration
-    ]
+        apart |= set(HANGING)
+    free = [n for n in model.parameter_names if n not in apart]
     free += names_of_runs(model, data.train)
     for n in free:
         values[n] = min(max(values[n], limits[n][0]), limits[n][1])
