@@ -340,7 +340,7 @@ def adapt(
     )
 
 
-def settled(model: JointModel, sensing: Sensing) -> dict[str, float]:
+def idle_shapes(model: JointModel, sensing: Sensing) -> dict[str, float]:
     """Parameters that shape what stands in for a signal, where that signal is recorded: they have
     nothing to shape and keep their start.
     """

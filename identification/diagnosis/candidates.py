@@ -15,7 +15,7 @@ import numpy as np
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.effect import ANYTHING_KNOWN, SECOND_BALANCE, TORQUE_SENSOR, Place
 from identification.balance.dataset import HOLD_DELAY, Dataset, with_effect
-from identification.balance.sensing import Sensing, settled
+from identification.balance.sensing import Sensing, idle_shapes
 
 WARM_UP: Final = 15.0
 """Shortest run in which a warm-up is looked for without a temperature channel [s]."""
@@ -290,7 +290,7 @@ def _placed(effect: Effect, place: Place, model: JointModel, sensing: Sensing) -
     for variant in variants:
         bigger = with_effect(variant, label)
         term = next(t for t in bigger.terms if t.label == label)
-        kept = settled(bigger, sensing)
+        kept = idle_shapes(bigger, sensing)
         pairs = [
             (n, p) for n, p in zip(term.names, effect.parameters, strict=True) if n not in kept
         ]

@@ -27,7 +27,7 @@ from identification.balance.dataset import (
 from identification.balance.kinematic import held_scale
 from identification.balance.memory import Law, solution_of
 from identification.balance.noise import effective_share
-from identification.balance.sensing import settled
+from identification.balance.sensing import idle_shapes
 from identification.balance.stacked import (
     Stacked,
     floor_rows,
@@ -324,7 +324,7 @@ def posed(
     values.update({k: v for k, v in start.items() if k in values})
     fixed = {n: k.value for n, k in known.items() if k.value is not None and n in values}
     fixed.update(held_scale(model, data.sensing, known))
-    fixed.update(settled(model, data.sensing))
+    fixed.update(idle_shapes(model, data.sensing))
     values.update({n: v for n, v in fixed.items() if v is not None})
     limits = bounds_of(model, known, data)
     unseen = [n for n in unseen_by(model, data) if n not in fixed]

@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from identification.balance.dataset import HOLD_NAME
-from identification.balance.sensing import settled
+from identification.balance.sensing import idle_shapes
 from identification.fitting.engine import Dataset, Solution
 
 
@@ -22,7 +22,7 @@ def parameter_table(solution: Solution, data: Dataset) -> dict[str, dict[str, An
         and cosine pairs also as amplitude and phase; stderr None where it does not apply.
     """
     out: dict[str, dict[str, Any]] = {}
-    apart = {HOLD_NAME, *solution.model.calibration, *settled(solution.model, data.sensing)}
+    apart = {HOLD_NAME, *solution.model.calibration, *idle_shapes(solution.model, data.sensing)}
     for p in solution.model.parameters:
         if p.name in apart:
             continue

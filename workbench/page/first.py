@@ -12,7 +12,7 @@ from casadi_models import JointModel
 from casadi_models.term import HANGING, LOAD_COMPLIANCE
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
-from identification.balance.sensing import settled
+from identification.balance.sensing import idle_shapes
 from identification.fitting.engine import Dataset, Solution
 from identification.fitting.start_values import bounds_of, starts
 from identification.fitting.weak_form import WeakForm
@@ -43,7 +43,7 @@ def first_look(
     values = starts(model, data)
     values.update({k: float(v) for k, v in start.items() if k in values})
     fixed = {n: k.value for n, k in known.items() if k.value is not None}
-    fixed |= settled(model, data.sensing)
+    fixed |= idle_shapes(model, data.sensing)
     values.update({n: v for n, v in fixed.items() if n in values})
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape} - set(now.free)

@@ -17,7 +17,7 @@ from casadi_models import EFFECTS
 from casadi_models.signals import LocalSignals
 from identification import Record, improve
 from identification.balance.dataset import load_dataset, prepared_model
-from identification.balance.sensing import settled
+from identification.balance.sensing import idle_shapes
 from identification.data.joint_file import Joint, Known, parse_joint
 from identification.diagnosis.candidates import offered, shape_grid
 from identification.diagnosis.improvement import Improvement
@@ -92,7 +92,7 @@ def test_where_a_temperature_is_recorded_there_is_no_pace() -> None:
     train, held = (with_temperature(r) for r in runs(5.0))
     model = prepared_model(WARM, train)
     data = load_dataset([train], [held], WARM, model)
-    assert settled(model, data.sensing) == {PACE: 1.0}
+    assert idle_shapes(model, data.sensing) == {PACE: 1.0}
     typed = model.with_values({PACE: 2.0})
     for one in (model, typed):  # whatever a fit without temperature has left in the joint file
         solution = solve(one, data)
