@@ -210,7 +210,7 @@ class Session:
         longer: bool = False,
     ) -> None:
         self.bench, self.joint = bench, bench.joint
-        self._slow, self._worse = longer, spoilt if longer else made_worse
+        self._worse = spoilt if longer else made_worse
         self.progress: Progress = progress or (lambda text, share: None)
         self._warnings = tuple(warnings)
         self._refused = dict(refused)
@@ -581,9 +581,7 @@ class Session:
         return lambda text, share: self.progress(text, low + span * share)
 
     def _over(self, step: Step) -> bool:
-        """Whether a step leaves structure over the floor, as the rows of this session show it."""
-        if self._slow:
-            return bool(_standing_over(step))
+        """Whether a step leaves structure over the floor."""
         return any(not e.ratio <= RATIO_LIMIT for e in self.bench.ratios(step).values())
 
     def _unanswerable(self, start: Step) -> str:
