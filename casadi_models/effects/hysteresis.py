@@ -70,7 +70,6 @@ def _stops(
     "Swevers 2005)",
     memory=_stops,
     states=3,
-    several_valleys=True,
     dissipative=True,
     needs=("transmission_compliance",),
     confused_with=("structural_damping", "lugre", "backlash"),
