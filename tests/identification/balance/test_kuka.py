@@ -57,7 +57,10 @@ def test_zeros_and_skews_are_those_of_the_owners(axis: int) -> None:
         assert axis not in ZEROS or zero.value == pytest.approx(ZEROS[axis], abs=0.3e-3)
 
 
-@pytest.mark.parametrize(("axis", "owners"), [(1, 4.5778e6), (2, 7.5189e6), (3, 4.0999e6)])
+@pytest.mark.parametrize(
+    ("axis", "owners"),
+    [(1, 4.5778e6), pytest.param(2, 7.5189e6, marks=pytest.mark.slow), (3, 4.0999e6)],
+)
 def test_stiffness_is_of_the_right_order_or_said_not_to_be_told(axis: int, owners: float) -> None:
     solution = improved(axis).steps[-1].solution
     if "stiffness" in solution.unidentified:

@@ -113,7 +113,10 @@ def improved(seed: int, sensors: str) -> tuple[Improvement, Record, Record]:
 
 @pytest.mark.parametrize(
     ("seed", "sensors", "name"),
-    [(201006, "encoders", "cyclic_friction"), (200002, "all", "kinematic_error")],
+    [
+        pytest.param(201006, "encoders", "cyclic_friction", marks=pytest.mark.slow),
+        (200002, "all", "kinematic_error"),
+    ],
 )
 def test_clocks_are_asked_again_beside_what_is_missing(seed: int, sensors: str, name: str) -> None:
     """The start model lacks a law of fifty and of a hundred and fifty times the noise, and its
@@ -134,7 +137,8 @@ def test_a_comparison_has_the_clocks_that_the_loop_has() -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "kind", "waits"), [(435003, "single", 3.65), (431007, "pair", 1.02)]
+    ("seed", "kind", "waits"),
+    [(435003, "single", 3.65), pytest.param(431007, "pair", 1.02, marks=pytest.mark.slow)],
 )
 def test_a_drive_later_than_a_clock_waits_for_a_part_and_is_filtered_for_the_rest(
     seed: int, kind: str, waits: float, tmp_path: Path
