@@ -5,6 +5,7 @@ in a folder.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gzip
 import hashlib
 import importlib
@@ -175,6 +176,10 @@ def _held(session: Session) -> None:
         ) from None
 
 
+ACCEPTED: Final = 10
+"""Rounds of the loop in which an accepted socket has become a connection: it takes three."""
+
+
 @final
 class PageServer(uvicorn.Server):  # type: ignore[misc]
     """The server of the page, which stops at once also where pages are open."""
@@ -183,12 +188,19 @@ class PageServer(uvicorn.Server):  # type: ignore[misc]
         """End what would go on for ever, then stop; no connection outlives the server.
 
         The parent tells the connections that it knows. One that is accepted while it does so would
-        stay open without a reader: a browser that asks on it waits for ever.
+        stay open without a reader: a browser that asks on it waits for ever. So nothing is accepted
+        any more before a server closes: what is accepted of a closed one is no connection, and is
+        told nothing until it is collected as garbage.
         """
         if isinstance(self.config.app, Guard):
             self.config.app.end()
+        loop = asyncio.get_running_loop()
         for server in self.servers:
-            server.close()
+            for listening in server.sockets:
+                with contextlib.suppress(NotImplementedError):  # a loop without readers
+                    loop.remove_reader(listening.fileno())
+        for _ in range(ACCEPTED):
+            await asyncio.sleep(0)
         await asyncio.sleep(0.05)  # what is accepted already becomes a connection that is told
         await super().shutdown(sockets)
         for connection in list(self.server_state.connections):

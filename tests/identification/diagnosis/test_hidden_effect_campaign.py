@@ -109,7 +109,7 @@ def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, d
     assert result["claims"] == []
 
 
-@pytest.mark.parametrize("kind", ["local_bump", "odd_order"])
+@pytest.mark.parametrize("kind", [pytest.param("local_bump", marks=pytest.mark.slow), "odd_order"])
 def test_what_is_outside_the_library_is_located_and_not_named(tmp_path: Path, kind: str) -> None:
     found, result = judged(tmp_path, kind, 4005)
     assert [c for c in result["claims"] if "curve" not in c] == []  # a curve names no effect
