@@ -5,7 +5,7 @@ in a folder.
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import asyncio.trsock
 import gzip
 import hashlib
 import importlib
@@ -180,6 +180,14 @@ ACCEPTED: Final = 10
 """Rounds of the loop in which an accepted socket has become a connection: it takes three."""
 
 
+def _unheard(loop: asyncio.AbstractEventLoop, listening: asyncio.trsock.TransportSocket) -> bool:
+    """Whether a loop accepts nothing of a socket any more."""
+    try:
+        return loop.remove_reader(listening.fileno())
+    except NotImplementedError:
+        return False
+
+
 @final
 class PageServer(uvicorn.Server):  # type: ignore[misc]
     """The server of the page, which stops at once also where pages are open."""
@@ -196,9 +204,8 @@ class PageServer(uvicorn.Server):  # type: ignore[misc]
             self.config.app.end()
         loop = asyncio.get_running_loop()
         for server in self.servers:
-            for listening in server.sockets:
-                with contextlib.suppress(NotImplementedError):  # a loop without readers
-                    loop.remove_reader(listening.fileno())
+            if not all(_unheard(loop, listening) for listening in server.sockets):
+                server.close()  # a loop that hears its sockets in another way
         for _ in range(ACCEPTED):
             await asyncio.sleep(0)
         await asyncio.sleep(0.05)  # what is accepted already becomes a connection that is told
