@@ -69,7 +69,12 @@ def test_a_reading_that_is_early_is_shifted_as_no_filter_makes_it_so() -> None:
 
 
 @pytest.mark.parametrize(
-    ("channel", "samples"), [("link_position", 3), ("link_torque", 1), ("motor_current", 3)]
+    ("channel", "samples"),
+    [
+        pytest.param("link_position", 3, marks=pytest.mark.slow),
+        ("link_torque", 1),
+        ("motor_current", 3),
+    ],
 )
 def test_claims_and_parameters_do_not_hang_on_a_late_channel(channel: str, samples: int) -> None:
     plain, found = demo(channel, 0), demo(channel, samples)
@@ -213,7 +218,9 @@ def soft(
 
 
 @pytest.mark.parametrize("motion", ["steps", "sweeps"])
-@pytest.mark.parametrize("late_by", [0, 2, 5, 11])
+@pytest.mark.parametrize(
+    "late_by", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 5)), 11]
+)
 def test_a_torque_beside_the_motor_alone_is_put_in_time(motion: str, late_by: int) -> None:
     """The torque is no law of the motor's motion."""
     records, joint, period = soft(motion, late_by)

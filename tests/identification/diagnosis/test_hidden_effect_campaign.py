@@ -32,7 +32,7 @@ def judged(
     ("effect", "options"),
     [
         ("stribeck", {}),
-        ("cubic_stiffness", {"dirt": True}),
+        pytest.param("cubic_stiffness", {"dirt": True}, marks=pytest.mark.slow),
         ("load_dependent_friction", {}),
         ("hysteresis", {}),
         pytest.param("torque_sensor_offset", {}, marks=pytest.mark.slow),
@@ -53,7 +53,7 @@ def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(
 @pytest.mark.parametrize(
     ("effect", "seed"),
     [
-        ("cyclic_torque", 7001),
+        pytest.param("cyclic_torque", 7001, marks=pytest.mark.slow),
         ("stribeck", 7000),
         ("kinematic_error", 7001),
         pytest.param("asymmetric_coulomb", 7000, marks=pytest.mark.slow),
@@ -78,7 +78,11 @@ def test_one_record_with_few_reversals_names_the_effect(
 
 @pytest.mark.parametrize(
     ("effect", "verdict"),
-    [(None, "nothing_missing"), ("stribeck", "complete"), ("piecewise_stiffness", "complete")],
+    [
+        (None, "nothing_missing"),
+        ("stribeck", "complete"),
+        pytest.param("piecewise_stiffness", "complete", marks=pytest.mark.slow),
+    ],
 )
 def test_a_joint_that_sticks_at_its_turns_leaves_nothing_at_125_hz(
     tmp_path: Path, effect: str | None, verdict: str
@@ -103,7 +107,10 @@ def test_a_relative_is_not_added_beside_the_wrong_name_of_a_set(tmp_path: Path) 
     assert result["verdict"] == "complete"
 
 
-@pytest.mark.parametrize(("seed", "dirt"), [(4002, False), (4003, False), (4004, True)])
+@pytest.mark.parametrize(
+    ("seed", "dirt"),
+    [(4002, False), pytest.param(4003, False, marks=pytest.mark.slow), (4004, True)],
+)
 def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, dirt: bool) -> None:
     _, result = judged(tmp_path, None, seed, dirt=dirt)
     assert result["claims"] == []

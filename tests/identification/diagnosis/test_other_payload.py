@@ -146,6 +146,7 @@ def test_a_law_that_passes_less_noise_on_is_not_the_more_probable_one(seed: int)
     assert sum(told.confidence.get(n, 0.0) for n in GAINS) > 0.95
 
 
+@pytest.mark.slow
 def test_the_motor_constant_after_an_unloaded_run() -> None:
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)
     loaded, held = record("loaded", 1, True, *slow), record("held out", 2, True, *slow)
@@ -159,6 +160,7 @@ def test_the_motor_constant_after_an_unloaded_run() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_names_left_out_of_the_set_fit_worse_on_held_out_records() -> None:
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)
     loaded, held = record("loaded", 1, True, *slow), record("held out", 2, True, *slow)

@@ -25,6 +25,7 @@ def improved(folder: Path) -> Improvement:
     return improve(train, load_joint(folder / "joint.toml"), held)
 
 
+@pytest.mark.slow
 def test_laws_of_the_position_that_imitate_a_soft_stop_give_way_to_its_curve(
     tmp_path: Path,
 ) -> None:

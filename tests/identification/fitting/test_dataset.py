@@ -57,7 +57,9 @@ def late(record: WeakRecord, place: str) -> float:
     return record.shifts.get(place, 0.0) / record.grid.dt
 
 
-@pytest.mark.parametrize(("seed", "true"), [(193004, 2.479), (181014, 2.427)])
+@pytest.mark.parametrize(
+    ("seed", "true"), [pytest.param(193004, 2.479, marks=pytest.mark.slow), (181014, 2.427)]
+)
 def test_a_torque_sensor_is_as_late_as_the_balances_together_have_it(
     seed: int, true: float, tmp_path: Path
 ) -> None:
@@ -70,7 +72,7 @@ def test_a_torque_sensor_is_as_late_as_the_balances_together_have_it(
         assert late(w, "torque_sensor") == pytest.approx(true, abs=0.1)
 
 
-@pytest.mark.parametrize("seed", [197008, 197009])
+@pytest.mark.parametrize("seed", [197008, pytest.param(197009, marks=pytest.mark.slow)])
 def test_a_filtered_drive_is_told_from_one_that_waits_by_what_the_fit_leaves(
     seed: int, tmp_path: Path
 ) -> None:
@@ -202,7 +204,7 @@ def test_half_a_cycle_is_a_number_where_three_points_are_no_parabola(
     assert 0.0 <= early <= 2 * half
 
 
-@pytest.mark.parametrize("seed", [173007, 173017])
+@pytest.mark.parametrize("seed", [pytest.param(173007, marks=pytest.mark.slow), 173017])
 def test_a_stick_shorter_than_a_kernel_is_no_structure(seed: int, tmp_path: Path) -> None:
     """Light joints at 1 kHz, nothing hidden: they stand for a millisecond at each turn, and a tenth
     of the rows then held nine tenths of what was left, 4.3 and 5.4 times the noise.
@@ -212,6 +214,7 @@ def test_a_stick_shorter_than_a_kernel_is_no_structure(seed: int, tmp_path: Path
     assert max(e.ratio for e in made.ratios(made.step(None, None, made.start())).values()) < 1.5
 
 
+@pytest.mark.slow
 def test_a_missing_scale_bends_no_clock(tmp_path: Path) -> None:
     """A drive through a low-pass, and a motor constant that is off: half of the lateness as a wait
     fits best where the scale is missing, and beside that no name was found.

@@ -26,7 +26,11 @@ def scaled(record: Record, factor: float) -> Record:
 
 @pytest.mark.parametrize(
     ("effect", "factor"),
-    [(None, 1.001), (None, 0.998), pytest.param("stribeck", 1.002, marks=pytest.mark.slow)],
+    [
+        (None, 1.001),
+        pytest.param(None, 0.998, marks=pytest.mark.slow),
+        pytest.param("stribeck", 1.002, marks=pytest.mark.slow),
+    ],
 )
 def test_a_scale_that_is_wrong_is_named_with_its_value(
     tmp_path: Path, effect: str | None, factor: float

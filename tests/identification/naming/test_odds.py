@@ -413,6 +413,7 @@ def test_names_that_are_less_probable_than_nothing_are_no_claim(drags: Contest) 
     assert doubted.nothing > sure.nothing
 
 
+@pytest.mark.slow
 def test_a_drift_does_not_decide_between_two_names(tmp_path: Path) -> None:
     """A torque that is periodic in the position takes a part of one course of a drift, and rows in
     which it did were as many witnesses against the motor constant that is off.

@@ -96,7 +96,7 @@ def test_a_job_is_done_again_where_its_fmu_has_changed(place: Path) -> None:
     assert not set(before) & set(after)
 
 
-@pytest.mark.parametrize("task", ["improve", "explore"])
+@pytest.mark.parametrize("task", ["improve", pytest.param("explore", marks=pytest.mark.slow)])
 def test_other_tasks_give_what_their_verbs_give(place: Path, task: str) -> None:
     drag = 0.15
     record = axis(lambda _q, w: drag * w * abs(w), seconds=8.0, h=4e-3)

@@ -80,7 +80,9 @@ def test_where_nothing_is_hidden_the_fmu_as_it_is_is_recommended(path: Path) -> 
     assert found.aside == () and found.model.correction is None
 
 
-@pytest.mark.parametrize("hidden", ["torque_sensor_gain", "hysteresis"])
+@pytest.mark.parametrize(
+    "hidden", ["hysteresis", pytest.param("torque_sensor_gain", marks=pytest.mark.slow)]
+)
 def test_a_variant_is_as_near_as_its_whole_fit(path: Path, hidden: str) -> None:
     """The FMU's parameters follow a variant as far as that is linear: about the right values its
     error is that of the fit that runs the FMU again. The joint that is left and the FMU both have a
@@ -103,6 +105,7 @@ def test_a_variant_is_as_near_as_its_whole_fit(path: Path, hidden: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_joint_of_one_side_is_explored(tmp_path: Path) -> None:
     """From the command line: one search gives the report, the data and the file."""
     build("Axis", tmp_path, Make(3, CS)).replace(tmp_path / "axis.fmu")

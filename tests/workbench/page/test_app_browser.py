@@ -161,6 +161,7 @@ def take_home(browser: Browser, tmp_path: Path) -> None:
     browser.shot("export")
 
 
+@pytest.mark.slow
 def test_the_loop_on_stribeck(served: Served, browser: Browser, tmp_path: Path) -> None:
     folder = need(SHARED / "hidden_effect" / "stribeck")
     page = browser.page

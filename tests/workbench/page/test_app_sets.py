@@ -69,9 +69,8 @@ def a_law_is_picked_from_a_learned_curve(page: Any) -> None:
     ("name", "most"),
     [
         ("emps", 8),
-        ("quanser", 12),
         ("kuka_axis1", 12),
-        pytest.param("hebi", 12, marks=pytest.mark.slow),
+        *(pytest.param(n, 12, marks=pytest.mark.slow) for n in ("quanser", "hebi")),
     ],
 )
 def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: int) -> None:
