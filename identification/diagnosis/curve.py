@@ -243,6 +243,7 @@ def _refitted(base: Base) -> Base:
         base,
         solution=replace(solution, values={**solution.values, **moved}),
         held_residual=base.held_residual + base.held_jacobian @ delta,
+        noise=None,
     )
 
 
@@ -760,6 +761,7 @@ def lacking(base: Base, labels: Collection[str]) -> Base:
         names=tuple(base.names[i] for i in kept) + tuple(base.inward_names[i] for i in freed),
         norms=np.concatenate([base.norms[kept], base.inward_norms[freed]]),
         held_jacobian=np.column_stack([base.held_jacobian[:, kept], base.held_inward[:, freed]]),
+        noise=None,
     )
 
 

@@ -100,4 +100,5 @@ def _with_columns(base: Base, table: FloatArray, held: FloatArray) -> Base:
         orthonormal=orthonormal,
         residual=base.residual - orthonormal @ (orthonormal.T @ base.residual),
         held_jacobian=np.column_stack([base.held_jacobian, held[:, use] / sizes[use]]),
+        noise=None,
     )

@@ -18,13 +18,27 @@ from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.noise import effective_share
-from identification.balance.stacked import drawn_floors, passed_on, rms, taking_part
+from identification.balance.stacked import (
+    drawn_floors,
+    noise_believed,
+    passed_on,
+    rms,
+    taking_part,
+)
 from identification.balance.weak import WeakRecord
 from identification.data.formats import words
 from identification.diagnosis.candidates import Candidate, NotTestable, shape_grid
 from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
-from identification.fitting.signed_fit import projected_gain, signed_fit
+from identification.fitting.errors_in_variables.products import (
+    MOST_NOISE,
+    DrawnRows,
+    certain,
+    moved_rows,
+    rows_drawn,
+    shares,
+)
+from identification.fitting.signed_fit import inverse, projected_gain, signed_fit
 from identification.fitting.start_values import bounds_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -39,6 +53,8 @@ away.
 COLLINEAR: Final = 2e-3
 """Share of a candidate's columns outside the base below which it is not testable."""
 
+ALL_NOISE: Final = "what the readings show of it beside the model is noise"
+"""Why a candidate is not tried whose columns outside the base noise makes."""
 UNNAMED_LINE: Final = "explains most of a line whose order has no name"
 """Why a periodic effect is no candidate whose own order is none that it may have."""
 REFINE_SHARE: Final = 0.1
@@ -60,6 +76,43 @@ DEPENDENT: Final = 1e-9
 """Singular value, as a share of the largest one, below which columns are dependent: far over the
 rounding of their sums, far below what records can show.
 """
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """What measurement noise adds to the products of the rows of a base.
+
+    Attributes
+    ----------
+    moved : mapping of str to (drawn rows, columns + 1) array
+        What drawn noise changes in the columns, as far as it is certain, and in the residual of
+        each balance.
+    score : mapping of str to (columns,) array
+        Products of all that it changes in the columns with what it changes in the residual.
+    believed : mapping of str to float
+        Share of the noise that the rows show.
+    residual : (n,) array, weighted
+        Where the equations of the base hold without the noise.
+    """
+
+    moved: Mapping[str, FloatArray]
+    score: Mapping[str, FloatArray]
+    believed: Mapping[str, float]
+    residual: FloatArray
+
+    def products(self, more: Mapping[str, FloatArray] | None = None) -> FloatArray:
+        """Of each balance, with further columns before the residual; none of the residual with
+        itself: that is the noise which rows are left with.
+        """
+        out = []
+        for b, rows in self.moved.items():
+            whole = rows if more is None else np.column_stack([rows[:, :-1], more[b], rows[:, -1]])
+            gram, own = whole.T @ whole, len(self.score[b])
+            gram[-1, -1] = 0.0
+            gram[:own, -1] = gram[-1, :own] = self.score[b]
+            out.append(gram)
+        return np.array(out)
 
 
 @final
@@ -91,6 +144,8 @@ class Base:
         Parameters of the columns of `inward`.
     inward_norms : (m,) array
         What these columns were divided by; negative where inward is downward.
+    noise : Noise, optional
+        Where the fit has taken noise off: a step of the base explains nothing by it.
     """
 
     solution: Solution
@@ -113,6 +168,7 @@ class Base:
     norms: FloatArray
     inward_names: tuple[str, ...] = ()
     inward_norms: FloatArray = field(default_factory=lambda: np.empty(0))
+    noise: Noise | None = None
 
     @property
     def parts(self) -> tuple[int, int]:
@@ -183,9 +239,36 @@ class Base:
         return np.column_stack([self.jacobian, self.inward, self.residual])[self.order]
 
     @cached_property
+    def tried(self) -> FloatArray:
+        """The same with the residual that a trial starts from."""
+        if self.noise is None:
+            return self.plain
+        return np.column_stack([self.plain[:, :-1], self.noise.residual[self.order]])
+
+    @cached_property
     def products(self) -> FloatArray:
         """Products of these within each block and balance."""
-        return self.grouped(self.plain, self.plain)
+        return self.grouped(self.tried, self.tried)
+
+    @cached_property
+    def noise_share(self) -> FloatArray:
+        """Part of what noise adds to a balance that falls to each block, (blocks, balances)."""
+        count = len(self.balances)
+        squares = np.bincount(
+            self.block[self.order] * count + self.balance[self.order],
+            weights=self.weight[self.order] ** 2,
+            minlength=self.blocks * count,
+        ).reshape(self.blocks, count)
+        return np.asarray(squares / np.maximum(squares.sum(axis=0), 1e-300))
+
+    def moved(self, drawn: DrawnRows, believed: Mapping[str, float]) -> dict[str, FloatArray]:
+        """What drawn noise changes in rows, with the weights of these."""
+        weights = np.split(self.weight, len(self.balances))
+        return moved_rows(drawn, self.data, dict(zip(self.balances, weights)), believed)
+
+    def less_noise(self, grams: FloatArray, noise: FloatArray) -> FloatArray:
+        """Products of each block and balance without what noise adds to each balance."""
+        return np.asarray(grams - self.noise_share[:, :, None, None] * noise)
 
     @cached_property
     def folds(self) -> int:
@@ -199,6 +282,8 @@ class Base:
         """
         p, own = self.parts
         grams = self.products
+        if self.noise is not None:
+            grams = self.less_noise(grams, self.noise.products())
         total = grams.sum(axis=(0, 1))
         out = np.zeros(grams.shape[:2])
         for test in self.held_out_folds():
@@ -241,8 +326,8 @@ def make_base(solution: Solution, data: Dataset) -> Base:
     inward = jw[:, back] / norms[back]
     jw = jw[:, alive] / norms[alive]
     orthonormal = span_of(jw)
-    rw = r * weight
-    rw = rw - orthonormal @ (orthonormal.T @ rw)
+    left = r * weight
+    rw = left - orthonormal @ (orthonormal.T @ left)
     shares = np.array(
         [
             effective_share(rw[balance == k][train.taking[b]])
@@ -269,7 +354,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         ho = np.empty((0, 0))
         hr, hj, hi = np.empty(0), np.empty((0, int(alive.sum()))), np.empty((0, int(back.sum())))
         hb, held_weights = np.empty(0, dtype=np.int64), np.empty(0)
-    return Base(
+    base = Base(
         solution,
         data,
         residual=rw,
@@ -291,6 +376,35 @@ def make_base(solution: Solution, data: Dataset) -> Base:
         inward_names=tuple(n for n, b in zip(names, back, strict=True) if b),
         inward_norms=(norms * towards)[back],
     )
+    return replace(base, noise=_noise_of(base, left)) if solution.noise_off else base
+
+
+def _noise_of(base: Base, left: FloatArray) -> Noise | None:
+    """What noise adds to the products of a base whose rows the fit has left at `left`, (n,)."""
+    solution, data = base.solution, base.data
+    names = [*base.names, *base.inward_names]
+    balances = balances_of(solution.model, data.sensing, wrt=bare(names))
+    drawn = rows_drawn(data, lambda w, _: stack(balances, [w], solution.values, names))
+    believed = noise_believed(solution.model, data, solution.values)
+    bent = _sizes(solution)
+    norms = np.concatenate([base.norms, base.inward_norms])
+    scale = np.append(np.where([n in bent for n in names], 0.0, 1 / norms), 1.0)
+    moved = {b: x * scale for b, x in base.moved(drawn, believed).items()}
+    p, own = base.parts
+    both = np.column_stack([base.jacobian, base.inward])
+    whole, noise = both.T @ both, sum(x[:, :-1].T @ x[:, :-1] for x in moved.values())
+    score = {b: x[:, :-1].T @ x[:, -1] for b, x in moved.items()}
+    onto = certain(whole, np.asarray(noise))
+    for x in moved.values():
+        x[:, :own] = x[:, :own] @ onto
+    kept = {b: x[:, :own].T @ x[:, :p] for b, x in moved.items()}
+    pulled = base.jacobian.T @ left - sum(x[:p] for x in score.values())
+    told = whole[:p, :p] - sum(x[:p] for x in kept.values())
+    step = -inverse(told) @ pulled
+    for b, x in moved.items():
+        x[:, -1] += x[:, :p] @ step
+        score[b] += kept[b] @ step
+    return Noise(moved, score, believed, left + base.jacobian @ step)
 
 
 def _unseen_sizes(
@@ -301,8 +415,7 @@ def _unseen_sizes(
 
     A step along such a column is of any length, and other records may show it.
     """
-    model = solution.model
-    sizes = {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
+    sizes = _sizes(solution)
     return np.array(
         [
             n in sizes and abs(solution.values[n]) * norm < UNSEEN
@@ -310,6 +423,12 @@ def _unseen_sizes(
         ],
         dtype=bool,
     )
+
+
+def _sizes(solution: Solution) -> set[str]:
+    """Shapes and smoothing velocities: they bend the columns, where first order does not hold."""
+    model = solution.model
+    return {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
 
 
 def span_of(columns: FloatArray) -> FloatArray:
@@ -357,12 +476,17 @@ def columns(
     balances: Balances,
 ) -> FloatArray:
     """Unweighted columns of the candidate's amplitudes at amplitude zero."""
+    stacked = stack(balances, records, _without_it(candidate, base, shapes))
+    return np.concatenate([stacked.jacobian[b] for b in balances.balances])
+
+
+def _without_it(candidate: Candidate, base: Base, shapes: Mapping[str, float]) -> dict[str, float]:
+    """Values of a candidate's model with its amplitudes zero."""
     values = {p.name: p.start for p in candidate.model.parameters}
     values.update(base.solution.values)
     values.update(dict.fromkeys(candidate.amplitudes, 0.0))
     values.update(shapes)
-    stacked = stack(balances, records, values)
-    return np.concatenate([stacked.jacobian[b] for b in balances.balances])
+    return values
 
 
 @final
@@ -554,12 +678,17 @@ def _score(
     raw: FloatArray,
     lows: FloatArray,
     inside: float,
-) -> Trial | None:
+) -> Trial | NotTestable | None:
     p, own = base.parts
     size = np.linalg.norm(raw * base.weight[:, None], axis=0)
     size = np.where(size > 0, size, 1.0)
     added = raw * base.weight[:, None] / size
-    grams = _bordered(base, added[base.order])
+    grams, noise = _bordered(base, added[base.order]), None
+    if base.noise is not None:
+        noise = noise_beside(candidate, base, base.noise, shapes, size)
+        if _all_noise(grams.sum(axis=(0, 1)), noise.sum(axis=0), own):
+            return NotTestable(candidate.effect.key, ALL_NOISE)
+        grams = base.less_noise(grams, noise)
     total = grams.sum(axis=(0, 1))
     sse1 = np.zeros(base.crossed.shape)
     for test in base.held_out_folds():
@@ -578,11 +707,18 @@ def _score(
         # where it does not help, it need not be paid for
         unit[where] = _unit(candidate, base, values, delta)[where]
     held = _held_out_drop(
-        candidate, base, balances=balances, shapes=shapes, delta=delta, size=size, where=where
+        candidate,
+        base,
+        balances=balances,
+        shapes=shapes,
+        delta=delta,
+        size=size,
+        where=where,
+        added=0.0 if noise is None else _quadratic_of(noise[where], delta),
     )
     contribution = float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2)))
     gains = _gains(base, sse1 / unit**2)
-    beside = _beside_base(added, base, delta)
+    beside = _beside_base(added, base, delta, total, noise)
     alone, error = _visible(beside, delta[own:], base.balance == where, contribution)
     return Trial(
         candidate,
@@ -597,6 +733,39 @@ def _score(
         own_gain=float(gains[where]),
         **{**told, "gain": float(gains.sum())},
     )
+
+
+def noise_beside(
+    candidate: Candidate,
+    base: Base,
+    noise: Noise,
+    shapes: Mapping[str, float],
+    size: FloatArray,
+) -> FloatArray:
+    """What noise adds to the products of each balance with the columns of a candidate between those
+    of the base and the residual, (balances, columns, columns).
+    """
+    names = candidate.amplitudes
+    balances = balances_of(candidate.model, base.data.sensing, wrt=names, columns_only=True)
+    values = _without_it(candidate, base, shapes)
+    drawn = rows_drawn(base.data, lambda w, _: stack(balances, [w], values))
+    moved = base.moved(drawn, noise.believed)
+    return noise.products({b: x[:, :-1] / size for b, x in moved.items()})
+
+
+def _all_noise(total: FloatArray, noise: FloatArray, own: int) -> bool:
+    """Whether of the columns of a candidate noise makes more of what is outside the base than is
+    certain of what is left (:data:`MOST_NOISE`).
+    """
+    inside, whole = slice(0, own), slice(own, -1)
+
+    def outside(gram: FloatArray) -> FloatArray:
+        across = gram[inside, whole]
+        known = inverse(gram[inside, inside])
+        return np.asarray(gram[whole, whole] - across.T @ known @ across)
+
+    plain, less = outside(total), outside(total - noise)
+    return bool(np.all(shares(plain, plain - less)[0] > MOST_NOISE))
 
 
 def _unit(
@@ -615,10 +784,9 @@ def _unit(
     # parameters of a foreign FMU are columns of the base and none of the joint's
     moved = zip(base.names, moves, strict=True)
     own |= {n: own[n] + float(d) for n, d in moved if n in own} | dict(values)
-    pairs = (
-        (_noise_alone(model, base.data, own), base.noise_alone),
-        (_torques_alone(model, base.data, own), base.torques_alone),
-    )
+    pairs = [(_torques_alone(model, base.data, own), base.torques_alone)]
+    if base.noise is None:  # else it is off the squares
+        pairs.append((_noise_alone(model, base.data, own), base.noise_alone))
     unit = [
         min([1.0, *(after[b] / before[b] for after, before in pairs if before[b] > 0)])
         for b in base.balances
@@ -723,7 +891,7 @@ def _bordered(base: Base, added: FloatArray) -> FloatArray:
     """
     own, more = base.parts[1], added.shape[1]
     plain = base.products
-    across = base.grouped(added, np.column_stack([base.plain, added]))
+    across = base.grouped(added, np.column_stack([base.tried, added]))
     out = np.empty((*plain.shape[:2], own + more + 1, own + more + 1))
     kept = [*range(own), own + more]
     out[:, :, np.array(kept)[:, None], kept] = plain
@@ -731,6 +899,12 @@ def _bordered(base: Base, added: FloatArray) -> FloatArray:
     out[:, :, kept, own:-1] = across[:, :, :, : own + 1].transpose(0, 1, 3, 2)
     out[:, :, own:-1, own:-1] = across[:, :, :, own + 1 :]
     return out
+
+
+def _quadratic_of(gram: FloatArray, delta: FloatArray) -> float:
+    """Value of a form at a step of all columns."""
+    there = np.append(delta, 1.0)
+    return float(there @ gram @ there)
 
 
 def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
@@ -745,8 +919,11 @@ def _held_out_drop(
     delta: FloatArray,
     size: FloatArray,
     where: int,
+    added: float,
 ) -> float:
-    """Fall of the RMS of a balance on records that the fit never saw, in percent."""
+    """Fall of the RMS of a balance on records that the fit never saw, in percent; `added`: what
+    noise in the columns adds to the squares of its training rows.
+    """
     if not len(base.held_residual):
         return math.nan
     p, own = base.parts
@@ -765,44 +942,75 @@ def _held_out_drop(
     )
     before, after = (x - base.held_own @ (base.held_own.T @ x) for x in (before, after))
     before, after = before[here], after[here]
-    return 100 * (1 - math.sqrt(float(after @ after) / max(float(before @ before), 1e-300)))
+    theirs, ours = base.held_weight[here], base.weight[base.balance == where]
+    added *= float(theirs @ theirs) / max(float(ours @ ours), 1e-300)
+    left = max(float(after @ after) - added, 0.0)
+    return 100 * (1 - math.sqrt(left / max(float(before @ before), 1e-300)))
+
+
+@final
+@dataclass(frozen=True)
+class _Outside:
+    """Columns of amplitudes that are not zero, less what the base may follow them with.
+
+    Attributes
+    ----------
+    columns : (n, active) array
+    gram : (active, active) array
+        What the rows tell of them.
+    scores : (blocks, active) array
+        Their products with the residual within each block.
+    """
+
+    columns: FloatArray
+    gram: FloatArray
+    scores: FloatArray
 
 
 def _beside_base(
-    added: FloatArray, base: Base, delta: FloatArray
-) -> tuple[FloatArray, FloatArray] | None:
-    """Columns of the amplitudes that are not zero, (n, active), less what the base may follow them
-    with, and their products with the residual within each block, (blocks, active); None where the
-    blocks are too few for them.
+    added: FloatArray,
+    base: Base,
+    delta: FloatArray,
+    total: FloatArray,
+    noise: FloatArray | None,
+) -> _Outside | None:
+    """The amplitudes that are not zero; None where the blocks are too few for them.
+
+    `total`: products of all columns and the residual, without what noise adds to each balance.
     """
     p, own = base.parts
-    q = base.orthonormal
-    moving = base.inward[:, delta[p:own] > 0]
-    if moving.shape[1]:
-        q = np.column_stack([q, np.linalg.qr(moving - q @ (q.T @ moving))[0]])
     active = np.flatnonzero(delta[own:])
     blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
     if not len(active) or blocks <= len(active) + 1:
         return None
-    c = added - q @ (q.T @ added)
-    c = c[:, active]
-    residual = (
-        base.residual + base.jacobian @ delta[:p] + base.inward @ delta[p:own] + added @ delta[own:]
-    )
-    begins = base.firsts[np.flatnonzero(np.diff(base.block[base.order[base.firsts]], prepend=-1))]
-    return c, np.add.reduceat((c * residual[:, None])[base.order], begins, axis=0)
+    followers = np.concatenate([np.arange(p), p + np.flatnonzero(delta[p:own] > 0)])
+    across = total[np.ix_(followers, own + active)]
+    within = inverse(total[np.ix_(followers, followers)])
+    mix = np.zeros((len(delta), len(active)))
+    mix[followers] = -within @ across
+    mix[own + active, np.arange(len(active))] = 1.0
+    rows = np.column_stack([base.tried[:, :own], added[base.order]])
+    c, residual = rows @ mix, base.tried[:, -1] + rows @ delta
+    begins = np.flatnonzero(np.diff(base.block[base.order], prepend=-1))
+    scores = np.add.reduceat(c * residual[:, None], begins, axis=0)
+    if noise is not None:
+        pulled = mix.T @ noise[:, :-1] @ np.append(delta, 1.0)  # by balance
+        share = base.noise_share[base.numbers.sum(axis=1) > 0]
+        scores = scores - share @ pulled
+    columns_ = np.zeros((len(base.block), len(active)))
+    columns_[base.order] = c
+    return _Outside(columns_, mix.T @ total[:-1, :-1] @ mix, scores)
 
 
-def _wald(beside: tuple[FloatArray, FloatArray] | None, amplitudes: FloatArray) -> float:
+def _wald(beside: _Outside | None, amplitudes: FloatArray) -> float:
     """p-value of the amplitudes, scores clustered by block."""
     if beside is None:
         return 1.0
-    c, scores = beside
-    return wald(c.T @ c, scores, amplitudes[amplitudes != 0])
+    return wald(beside.gram, beside.scores, amplitudes[amplitudes != 0])
 
 
 def _visible(
-    beside: tuple[FloatArray, FloatArray] | None,
+    beside: _Outside | None,
     amplitudes: FloatArray,
     here: npt.NDArray[np.bool_],
     contribution: float,
@@ -813,10 +1021,9 @@ def _visible(
     """
     if beside is None or not contribution > 0:
         return 0.0, math.inf
-    c, scores = beside
     size = amplitudes[amplitudes != 0] / contribution  # for 1 N.m
-    column, score, blocks = c @ size, scores @ size, len(scores)
-    gram = float(column @ column)
+    column, score, blocks = beside.columns @ size, beside.scores @ size, len(beside.scores)
+    gram = float(size @ beside.gram @ size)
     if not gram > 0:
         return 0.0, math.inf
     error = math.sqrt(float(score @ score) * blocks / (blocks - 1)) / gram

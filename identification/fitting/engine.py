@@ -96,6 +96,8 @@ class Solution:
         Largest correlation of each parameter with another one: (name, value).
     together : Correlation
         Of all that have a standard error, nuisances and what belongs to one run left out.
+    noise_off : bool
+        Whether what noise adds to the products of the columns was taken off them.
     """
 
     model: JointModel
@@ -109,6 +111,7 @@ class Solution:
     correlation: Mapping[str, tuple[str, float]] = field(default_factory=dict)
     iterations: int = 0
     together: Correlation = Correlation()
+    noise_off: bool = False
 
     @property
     def law(self) -> Law:
@@ -647,4 +650,5 @@ def _with_errors(
         correlation=correlation,
         iterations=used,
         together=together,
+        noise_off=without.instruments is None and bool(np.any(without.noise.whole[0])),
     )

@@ -83,6 +83,12 @@ def part_inverse(part: FloatArray, whole: FloatArray) -> FloatArray:
     return np.asarray((kept / value[value > _LEAST]) @ kept.T, dtype=np.float64)
 
 
+def inverse(gram: FloatArray) -> FloatArray:
+    """Inverse of a normal matrix, zero on the directions of which the rows know nothing."""
+    white = _whitened(gram)
+    return np.asarray(white @ white.T, dtype=np.float64)
+
+
 def _whitened(gram: FloatArray) -> FloatArray:
     """Columns W with W' gram W = 1, without the directions of which the rows know nothing."""
     scale = 1 / np.sqrt(np.diag(gram))

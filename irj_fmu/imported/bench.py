@@ -647,6 +647,7 @@ def with_nuisance(base: Base, columns: Sequence[FloatArray], names: Sequence[str
         held_jacobian=np.column_stack([base.held_jacobian, *held]),
         names=(*base.names, *kept),
         norms=np.append(base.norms, norms),
+        noise=None,
     )
 
 

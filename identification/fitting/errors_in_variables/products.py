@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import Stacked, noise_believed, stack
 from identification.balance.weak import WeakRecord
@@ -84,15 +85,24 @@ DrawnRows = list[list[tuple[Stacked, Stacked]]]
 """For each training record and draw: rows without and with the drawn noise."""
 
 
-def drawn_rows(problem: WeakForm) -> DrawnRows:
-    """Rows and columns of a problem as noise is drawn, at its values."""
-    balances, data = problem.balances, problem.data
+def drawn_rows(
+    problem: WeakForm, read: Callable[[WeakRecord, WeakRecord], WeakRecord] | None = None
+) -> DrawnRows:
+    """Rows and columns of a problem as noise is drawn, at its values; `read` makes of a drawn
+    record and its own what is looked at.
+    """
 
-    def rows(record: WeakRecord) -> Stacked:
-        return stack(balances, [record], problem.values, problem.free)
+    def rows(drawn: WeakRecord, record: WeakRecord) -> Stacked:
+        seen = drawn if read is None else read(drawn, record)
+        return stack(problem.balances, [seen], problem.values, problem.free)
 
+    return rows_drawn(problem.data, rows)
+
+
+def rows_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked]) -> DrawnRows:
+    """What is made of each training record without and with drawn noise."""
     return [
-        [(rows(draw.calm), rows(draw.noisy)) for draw in draws_of(record, data.sources)]
+        [(rows(d.calm, record), rows(d.noisy, record)) for d in draws_of(record, data.sources)]
         for record in data.train
     ]
 
@@ -120,40 +130,58 @@ def noise_products(
     believed : mapping of str to float, optional
         Of :func:`identification.balance.stacked.noise_believed`, where it is known.
     """
-    balances, data, free = problem.balances, problem.data, problem.free
-    model, count = balances.model, len(free)
-    straight = ~problem.bent
-    gram = {b: np.zeros((count, count)) for b in balances.balances}
-    score = {b: np.zeros(count) for b in balances.balances}
-    believed = believed or noise_believed(model, data, problem.values)
-    first, own = 0, own or drawn_rows(problem)
-    for record, pairs in zip(data.train, own, strict=True):
+    balances, data, straight = problem.balances, problem.data, ~problem.bent
+    believed = believed or noise_believed(balances.model, data, problem.values)
+    weights = {b: np.broadcast_to(problem.weights[b], (problem.rows,)) for b in balances.balances}
+    found = moved_rows(own or drawn_rows(problem), data, weights, believed)
+    theirs = found
+    if met:
+        others = drawn_rows(problem, lambda w, record: from_others(problem, w, record))
+        theirs = moved_rows(others, data, weights, believed)
+    gram, score = {}, {}
+    for b, rows in found.items():
+        moved = rows[:, :-1] * straight
+        by = theirs[b][:, :-1] * straight if b in met else moved
+        gram[b] = by.T @ moved
+        score[b] = by.T @ rows[:, -1]
+    return NoiseProducts(gram, score)
+
+
+def moved_rows(
+    drawn: DrawnRows,
+    data: Dataset,
+    weights: Mapping[str, FloatArray],
+    believed: Mapping[str, float],
+) -> dict[str, FloatArray]:
+    """What drawn noise changes in the columns and in the residual of each balance, (drawn rows,
+    columns + 1), weighted so that its products are what noise adds to those of all rows.
+
+    Parameters
+    ----------
+    drawn : list
+        Of the training records.
+    data : Dataset
+    weights : mapping of str to (rows,) array
+        Of the training rows.
+    believed : mapping of str to float
+        Of :func:`identification.balance.stacked.noise_believed`.
+    """
+    out: dict[str, list[FloatArray]] = {b: [] for b in weights}
+    first = 0
+    for record, pairs in zip(data.train, drawn, strict=True):
         rows = slice(first, first + record.rows)
         first = rows.stop
-        drawn = draws_of(record, data.sources)
-        for draw, (calm, noisy) in zip(drawn, pairs, strict=True):
-            theirs = (
-                [
-                    stack(balances, [from_others(problem, w, record)], problem.values, free)
-                    for w in (draw.calm, draw.noisy)
-                ]
-                if met
-                else [calm, noisy]
-            )
-            for b in balances.balances:
-                weight = np.broadcast_to(problem.weights[b], (problem.rows,))[rows]
-                squares = weight**2 * record.taking(b)
+        for draw, (calm, noisy) in zip(draws_of(record, data.sources), pairs, strict=True):
+            for b, given in weights.items():
+                squares = given[rows] ** 2 * record.taking(b)
                 # pieces of a long record stand for all of it
                 whole = np.sum(squares) / max(float(np.sum(squares[draw.rows])), 1e-300)
-                weight = weight[draw.rows] * (believed[b] * np.sqrt(whole / len(drawn)))
-                moved = (noisy.jacobian[b] - calm.jacobian[b]) * weight[:, None] * straight
-                by = moved
-                if b in met:
-                    by = (theirs[1].jacobian[b] - theirs[0].jacobian[b]) * weight[:, None]
-                    by = by * straight
-                gram[b] += by.T @ moved
-                score[b] += by.T @ ((noisy.residual[b] - calm.residual[b]) * weight)
-    return NoiseProducts(gram, score)
+                weight = given[rows][draw.rows] * (believed[b] * np.sqrt(whole / len(pairs)))
+                moved = np.column_stack(
+                    [noisy.jacobian[b] - calm.jacobian[b], noisy.residual[b] - calm.residual[b]]
+                )
+                out[b].append(moved * weight[:, None])
+    return {b: np.concatenate(parts) for b, parts in out.items()}
 
 
 def no_noise(problem: WeakForm) -> NoiseProducts:
@@ -179,12 +207,27 @@ def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
 def shares(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Share of noise in directions that are independent in both matrices, and the directions:
     columns whose products add up to `whole`."""
+    share, left, _ = _apart(whole, noise)
+    return share, left
+
+
+def certain(whole: FloatArray, noise: FloatArray) -> FloatArray:
+    """What drawn columns are multiplied by, (p, p), so that of no direction of `whole` they hold
+    more than is certain (:data:`MOST_NOISE`); `noise` is what they add to it.
+    """
+    share, left, right = _apart(whole, noise)
+    less = np.sqrt(np.clip(share, 0.0, MOST_NOISE) / np.maximum(share, 1e-300))
+    return np.asarray(right * less @ left.T, dtype=np.float64)
+
+
+def _apart(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """As :func:`shares`, and the combinations of the columns that the directions are."""
     value, vector = np.linalg.eigh(whole)
     kept = value > 1e-12 * value[-1]
     root = vector[:, kept] * np.sqrt(value[kept])
     white = vector[:, kept] / np.sqrt(value[kept])
     share, direction = np.linalg.eigh(white.T @ noise @ white)
-    return share, np.asarray(root @ direction, dtype=np.float64)
+    return share, root @ direction, white @ direction
 
 
 @final
@@ -210,9 +253,12 @@ __all__ = [
     "DrawnRows",
     "NoiseProducts",
     "Unbiased",
+    "certain",
     "drawn_rows",
+    "moved_rows",
     "no_noise",
     "noise_products",
+    "rows_drawn",
     "shares",
     "whole_without",
 ]

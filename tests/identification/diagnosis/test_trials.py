@@ -25,6 +25,7 @@ from identification.diagnosis import trials
 from identification.diagnosis.candidates import Candidate, NotTestable
 from identification.diagnosis.claims import MAJOR_DROP
 from identification.diagnosis.trials import (
+    ALL_NOISE,
     FOLDS,
     KERNEL_SHARE,
     UNNAMED_LINE,
@@ -64,11 +65,12 @@ def made(
     effects: tuple[str, ...] = ("viscous", "coulomb"),
     known: Mapping[str, Known] = MappingProxyType({}),
 ) -> Base:
+    """Plain sums: as where a fit takes no noise off."""
     joint = Joint(model_name="hd1", effects=effects, known=known)
     runs = [record(np.random.default_rng([seed, k]), seconds, law) for k in (0, 1)]
     model = prepared_model(joint, runs[0])
     data = load_dataset(runs[:1], runs[1:] if held else [], joint, model)
-    return make_base(solve(model, data), data)
+    return replace(make_base(solve(model, data), data), noise=None)
 
 
 @pytest.fixture(scope="module")
@@ -491,9 +493,9 @@ def test_the_chance_of_a_size_by_scores_of_blocks(base: Base) -> None:
     """Arellano's sandwich over blocks, F with blocks minus amplitudes degrees of freedom."""
     weak = made(lambda q, v: 0.12 * np.sin(q + PHASE))
     found = tried(weak, "cyclic_torque")
-    c = raw_columns(weak, found)
     used = weak.block >= 0
-    q = np.linalg.qr(weak.jacobian)[0]
+    c = np.where(used[:, None], raw_columns(weak, found), 0.0)  # rows of blocks alone are fitted
+    q = np.linalg.qr(np.where(used[:, None], weak.jacobian, 0.0))[0]
     c = c - q @ (q.T @ c)
     fit = np.linalg.lstsq(
         np.column_stack([weak.jacobian, raw_columns(weak, found)])[used],
@@ -683,7 +685,7 @@ def test_an_amplitude_at_its_bound_may_leave_it_when_a_candidate_is_tried() -> N
 
 @pytest.fixture(scope="module")
 def elastic() -> Base:
-    """7.5 s of the demo's joint: three balances."""
+    """7.5 s of the demo's joint: three balances, plain sums."""
     folder = Path(__file__).resolve().parents[3] / "workbench" / "demo"
     joint = load_joint(folder / "joint.toml")
     train, held = (
@@ -692,7 +694,7 @@ def elastic() -> Base:
     )
     model = prepared_model(joint, train)
     data = load_dataset([train], [held], joint, model)
-    return make_base(solve(model, data), data)
+    return replace(make_base(solve(model, data), data), noise=None)
 
 
 @pytest.mark.parametrize("key", ["stribeck", "torque_sensor_gain", "cubic_stiffness"])
@@ -756,7 +758,9 @@ def test_a_gain_that_only_takes_noise_away_is_none() -> None:
     model = prepared_model(joint, run)
     data = load_dataset([run], [], joint, model)
     base = make_base(solve(model, data), data)
-    found = try_candidate(candidate(base, "torque_sensor_gain", "torque_sensor"), base)
+    gain = candidate(base, "torque_sensor_gain", "torque_sensor")
+    assert try_candidate(gain, base) == NotTestable("torque_sensor_gain", ALL_NOISE)
+    found = try_candidate(gain, replace(base, noise=None))  # where a fit takes no noise off
     assert isinstance(found, Trial)
     assert abs(found.values["torque_sensor_gain"]) > 0.1  # a slope over a column of noise
     assert found.cv_drop_percent > 15  # as long as nobody asks what noise alone would leave

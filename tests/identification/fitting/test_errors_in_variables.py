@@ -12,13 +12,16 @@ from scipy.sparse import csr_array
 
 from benchmarks.next_run import record_of
 from benchmarks.trust import joint_of, one_way
-from identification import Joint, Record, fit, load_joint, read
+from casadi_models import EFFECTS
+from identification import Joint, Record, fit, improve, load_joint, read
 from identification.balance.balances import balances_of
 from identification.balance.calibration import of_run
 from identification.balance.colour import white
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
 from identification.balance.excitation import attenuation
+from identification.diagnosis.candidates import Candidate
+from identification.diagnosis.trials import columns, make_base, noise_beside
 from identification.fitting.covariance import (
     BLOCK,
     OVERLAP,
@@ -43,7 +46,7 @@ NAMES = ("link_inertia", "link_viscous", "gravity_torque")
 JOINT = Joint(name="arm", gear_ratio=1.0, model_name="hd1", effects=("viscous@link", "gravity"))
 
 
-def run(seed: int, seconds: float = 30.0) -> tuple[Record, dict[str, float]]:
+def run(seed: int, seconds: float = 30.0, *, noise: float = 1.0) -> tuple[Record, dict[str, float]]:
     """A link under a measured torque; the truth is known in closed form."""
     rng = np.random.default_rng(880_000 + seed)
     true = dict(
@@ -58,8 +61,8 @@ def run(seed: int, seconds: float = 30.0) -> tuple[Record, dict[str, float]]:
         true["link_inertia"] * bend + true["link_viscous"] * v - true["gravity_torque"] * np.sin(q)
     )
     channels = {
-        "link_position": q + 6e-4 * rng.standard_normal(len(t)),
-        "link_torque": torque + 0.2 * rng.standard_normal(len(t)),
+        "link_position": q + noise * 6e-4 * rng.standard_normal(len(t)),
+        "link_torque": torque + noise * 0.2 * rng.standard_normal(len(t)),
     }
     return Record.from_channels(t, channels, name=f"run {seed}"), true
 
@@ -305,3 +308,57 @@ def test_what_noise_is_taken_off_by_does_not_run_away_from_a_law_with_shapes(
     found = fit(joint, read(folder / "train.csv", joint=joint)).solution.values
     assert found["motor_coulomb"] == pytest.approx(case.values["M_TC"], rel=0.3)
     assert found["motor_stribeck_extra"] == pytest.approx(case.values["M_TS"], rel=0.3)
+
+
+@pytest.mark.parametrize("noise", [1.0, 3.0])
+def test_a_trial_has_the_products_of_signals_without_noise(noise: float) -> None:
+    """Of the columns of the model and of one that is tried, in the rows that both records have."""
+    (noisy, _), (calm, _) = run(0, noise=noise), run(0, noise=0.0)
+    model = prepared_model(JOINT, noisy)
+    data, still = (load_dataset([r], [], JOINT, model) for r in (noisy, calm))
+    solution = solve(model, data)
+    assert solution.noise_off
+    base, plain = make_base(solution, data), make_base(replace(solution, noise_off=False), still)
+    assert base.noise is not None and plain.noise is None
+    drag = model.add("quadratic_drag@link")
+    tried = Candidate(
+        "quadratic_drag@link", EFFECTS["quadratic_drag"], "link", drag, ("link_quadratic_drag",), ()
+    )
+    balances = balances_of(drag, data.sensing, wrt=tried.amplitudes, columns_only=True)
+    both = (base.block >= 0) & (plain.block >= 0)
+    grams, size = [], np.ones(1)
+    for seen in (base, plain):
+        column = columns(tried, seen, {}, seen.data.train, balances) * seen.weight[:, None]
+        size = np.linalg.norm(column, axis=0) if seen is base else size
+        rows = np.column_stack([seen.jacobian * seen.norms / base.norms, column / size])[both]
+        grams.append(rows.T @ rows)
+    added = noise_beside(tried, base, base.noise, {}, size).sum(axis=0)[:-1, :-1]
+    share = float(np.mean(both) / np.mean(base.block >= 0))
+    off, left = (np.abs(g - grams[1]).max() for g in (grams[0], grams[0] - share * added))
+    assert off > 0.03 * noise
+    assert left < 0.1 * off
+
+
+def test_the_equations_of_a_fit_hold_where_a_trial_starts() -> None:
+    """What the columns have in common with the residual is what noise gives both."""
+    record, _ = run(0)
+    data = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
+    base = make_base(solve(prepared_model(JOINT, record), data), data)
+    assert base.noise is not None
+    meeting = base.jacobian.T @ base.noise.residual
+    pulled = sum(base.noise.score.values())
+    assert np.abs(pulled).max() > 1.0
+    assert meeting == pytest.approx(pulled, abs=1e-6 * float(np.abs(pulled).max()))
+
+
+def test_a_law_beside_encoders_of_twelve_bits_is_named(tmp_path: Path) -> None:
+    """By plain least squares laws led that let the inertia of the link be another, which passes
+    less noise on, and the hidden hysteresis was none of the first five.
+    """
+    folder = write_case(make_case(254002, kind="pair", size=1.0), tmp_path, "encoders")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    found = improve(train, joint, [held])
+    assert found.verdict == "complete"
+    assert {"stribeck", "hysteresis"} <= {n for c in found.claims for n in c.effects}
+    assert all(e.ratio < 1.2 for e in found.steps[-1].held_out.balances.values())
