@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Final, final
 from weakref import WeakValueDictionary
 
@@ -83,6 +83,7 @@ def whole(samples: float) -> int:
     return math.floor(samples + 0.5 + HALF)
 
 
+@lru_cache(256)
 def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     """Samples of the cos^4 kernel or of a derivative of it, for correlation with a signal.
 
@@ -97,7 +98,7 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
 
     Returns
     -------
-    (k,) array, k odd
+    (k,) array, k odd, not to be written to
         Weights that reproduce the derivative of polynomials up to `order` + 1 exactly.
     """
     half = max(1 if order == 1 else order + 2, whole(length / dt / 2))  # 1: central difference
@@ -114,9 +115,11 @@ def kernel(length: float, dt: float, order: int = 0) -> FloatArray:
     weights: FloatArray = (
         weighted @ coefficients * float(np.prod(np.arange(1, order + 1))) / scale**order
     )
+    weights.setflags(write=False)
     return weights
 
 
+@lru_cache(256)
 def differentiated_kernel(length: float, dt: float, order: int, step: int = 1) -> FloatArray:
     """Derivative of the cos^4 kernel itself, so that averages of a signal and of its derivative
     agree.
@@ -147,8 +150,9 @@ def differentiated_kernel(length: float, dt: float, order: int, step: int = 1) -
         gram = powers.T @ (powers * unit[:, None])
         weights = weights - (powers * unit[:, None]) @ np.linalg.solve(gram, np.array(moments))
     factorial = float(np.prod(np.arange(1, order + 1)))
-    weights = weights * factorial / np.sum(weights * t**order)
-    return np.asarray(weights, dtype=np.float64)
+    weights = np.asarray(weights * factorial / np.sum(weights * t**order), dtype=np.float64)
+    weights.setflags(write=False)
+    return weights
 
 
 @final

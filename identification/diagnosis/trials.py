@@ -32,6 +32,7 @@ from identification.fitting.covariance import wald
 from identification.fitting.engine import Dataset, Solution, Stacked, row_weights, stack
 from identification.fitting.errors_in_variables.products import (
     MOST_NOISE,
+    SURE_STEP,
     DrawnRows,
     certain,
     moved_rows,
@@ -380,7 +381,9 @@ def make_base(solution: Solution, data: Dataset) -> Base:
 
 
 def _noise_of(base: Base, left: FloatArray) -> Noise | None:
-    """What noise adds to the products of a base whose rows the fit has left at `left`, (n,)."""
+    """What noise adds to the products of a base whose rows the fit has left at `left`, (n,); None
+    where of no direction it is a share that counts.
+    """
     solution, data = base.solution, base.data
     names = [*base.names, *base.inward_names]
     balances = balances_of(solution.model, data.sensing, wrt=bare(names))
@@ -392,9 +395,12 @@ def _noise_of(base: Base, left: FloatArray) -> Noise | None:
     moved = {b: x * scale for b, x in base.moved(drawn, believed).items()}
     p, own = base.parts
     both = np.column_stack([base.jacobian, base.inward])
-    whole, noise = both.T @ both, sum(x[:, :-1].T @ x[:, :-1] for x in moved.values())
+    whole = both.T @ both
+    noise = np.asarray(sum(x[:, :-1].T @ x[:, :-1] for x in moved.values()))
+    if not own or float(shares(whole, noise)[0].max()) < SURE_STEP:
+        return None
     score = {b: x[:, :-1].T @ x[:, -1] for b, x in moved.items()}
-    onto = certain(whole, np.asarray(noise))
+    onto = certain(whole, noise)
     for x in moved.values():
         x[:, :own] = x[:, :own] @ onto
     kept = {b: x[:, :own].T @ x[:, :p] for b, x in moved.items()}

@@ -37,6 +37,7 @@ from identification.fitting.errors_in_variables.instruments import (
 )
 from identification.fitting.errors_in_variables.products import (
     MOST_NOISE,
+    SURE_STEP,
     DrawnRows,
     NoiseProducts,
     Unbiased,
@@ -55,8 +56,6 @@ IntArray = npt.NDArray[np.int64]
 MOST_MET: Final = 0.999
 """The same where the columns of other sensors tell what is left: that is known as well as the sums
 over some thousand rows."""
-SURE_STEP: Final = 0.01
-"""Least share that counts: a fit has not ended to better than that of its squares."""
 MOST_HIDDEN: Final = 2.0
 """Times what noise hides in the direction that holds most of it: other directions hide some, too,
 and a correction that diverges leaves powers of ten more."""

@@ -24,6 +24,8 @@ MOST_NOISE: Final = 0.9
 """Largest share of the information on a direction that may be noise: the draws know it within 3 %,
 and what is left must stand clear of that.
 """
+SURE_STEP: Final = 0.01
+"""Least share that counts: a fit has not ended to better than that of its squares."""
 
 
 @final
