@@ -255,7 +255,13 @@ CASES: dict[str, tuple[str, OnlineOptions, Callable[[Joint], Joint]]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+LONG = ("motor side only", "known stiffness")
+"""What the other cases have, too: no channel of the link, fewer parameters than the model has."""
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow) if c in LONG else c for c in CASES]
+)
 def test_equals_python_for_other_joints_and_sensors(case: str, tmp_path: Path) -> None:
     """Fewer sensors, rigid and not fitted joints, internal states; tuned, held and reset on the
     way.

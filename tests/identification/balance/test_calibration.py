@@ -38,7 +38,7 @@ def demo(zero: float) -> Improvement:
     )
 
 
-@pytest.mark.parametrize("zero", [1e-4, 5e-3])
+@pytest.mark.parametrize("zero", [pytest.param(1e-4, marks=pytest.mark.slow), 5e-3])
 def test_claims_do_not_hang_on_where_the_encoder_has_its_zero(zero: float) -> None:
     plain, found = demo(0.0), demo(zero)
     assert [c.effects for c in found.claims] == [c.effects for c in plain.claims] == [("stribeck",)]
@@ -90,7 +90,7 @@ def test_how_far_the_gear_twists_does_not_hang_on_where_the_encoders_have_their_
     assert after == pytest.approx(before, rel=1e-6)
 
 
-@pytest.mark.parametrize("torque_sensor", [True, False])
+@pytest.mark.parametrize("torque_sensor", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_run_has_its_own_zero(torque_sensor: bool) -> None:
     zeros = (1e-3, -3e-3)
     plain = [record(f"run {i}", 3 + i, False, *FAST) for i in range(2)]

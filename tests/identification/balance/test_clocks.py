@@ -73,7 +73,7 @@ def test_a_reading_that_is_early_is_shifted_as_no_filter_makes_it_so() -> None:
     [
         pytest.param("link_position", 3, marks=pytest.mark.slow),
         ("link_torque", 1),
-        ("motor_current", 3),
+        pytest.param("motor_current", 3, marks=pytest.mark.slow),
     ],
 )
 def test_claims_and_parameters_do_not_hang_on_a_late_channel(channel: str, samples: int) -> None:
@@ -154,7 +154,7 @@ def fitted(channel: str, samples: float, torque: bool = True) -> Fit:
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("samples", [0.1, 0.5])
+@pytest.mark.parametrize("samples", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_part_of_a_sample_is_found_too(channel: str, samples: float) -> None:
     found, plain = fitted(channel, samples), fitted(channel, 0.0)
     was, now = (
@@ -390,6 +390,7 @@ def test_calm_rows_do_not_say_that_a_filter_waits(seed: int, given: str) -> None
         assert made.shifts["drive"] <= 0.0
 
 
+@pytest.mark.slow
 def test_less_noise_of_a_rate_is_no_lateness_of_a_torque() -> None:
     """With the torque of 3.5 samples later less of the drive's rate is taken, and its noise is most
     of what is left of 10 % lost samples: 1.88 N over a floor of .31 N on the held-out record."""

@@ -31,7 +31,7 @@ def judged(
 @pytest.mark.parametrize(
     ("effect", "options"),
     [
-        ("stribeck", {}),
+        pytest.param("stribeck", {}, marks=pytest.mark.slow),
         pytest.param("cubic_stiffness", {"dirt": True}, marks=pytest.mark.slow),
         ("load_dependent_friction", {}),
         ("hysteresis", {}),
@@ -54,7 +54,7 @@ def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(
     ("effect", "seed"),
     [
         pytest.param("cyclic_torque", 7001, marks=pytest.mark.slow),
-        ("stribeck", 7000),
+        pytest.param("stribeck", 7000, marks=pytest.mark.slow),
         ("kinematic_error", 7001),
         pytest.param("asymmetric_coulomb", 7000, marks=pytest.mark.slow),
         pytest.param("current_offset", 7003, marks=pytest.mark.slow),
@@ -80,7 +80,7 @@ def test_one_record_with_few_reversals_names_the_effect(
     ("effect", "verdict"),
     [
         (None, "nothing_missing"),
-        ("stribeck", "complete"),
+        pytest.param("stribeck", "complete", marks=pytest.mark.slow),
         pytest.param("piecewise_stiffness", "complete", marks=pytest.mark.slow),
     ],
 )
@@ -95,6 +95,7 @@ def test_a_joint_that_sticks_at_its_turns_leaves_nothing_at_125_hz(
     assert result["verdict"] == verdict
 
 
+@pytest.mark.slow
 def test_a_relative_is_not_added_beside_the_wrong_name_of_a_set(tmp_path: Path) -> None:
     """Three stiffnesses: soft wind-up and backlash together imitate them; the one law alone
     does as well.

@@ -323,6 +323,7 @@ def test_what_only_a_name_like_a_law_asks_for_is_a_part_of_that_law() -> None:
     assert said & {*found.others}
 
 
+@pytest.mark.slow
 def test_what_slow_rows_alone_say_against_a_name_says_nothing(tmp_path: Path) -> None:
     """Of a joint that creeps at its turns: dry friction under its level bends the curve there."""
     folder = write_case(make_case(13312, names=("stribeck",), size=1.0), tmp_path, "all")
@@ -334,7 +335,7 @@ def test_what_slow_rows_alone_say_against_a_name_says_nothing(tmp_path: Path) ->
     assert errors[1] < 0.3 * errors[0]
 
 
-@pytest.mark.parametrize("seed", [220011, 221007])
+@pytest.mark.parametrize("seed", [220011, pytest.param(221007, marks=pytest.mark.slow)])
 def test_what_only_longer_rows_show_is_held_against_their_curve(seed: int, tmp_path: Path) -> None:
     """In short rows a reading that hums hides the law, and what is a curve there is the hum. With a
     gap and slow rows, noise that was taken off the second's fit left eight times that noise.

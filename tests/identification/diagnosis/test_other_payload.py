@@ -190,6 +190,7 @@ def test_the_names_left_out_of_the_set_fit_worse_on_held_out_records() -> None:
     assert set(errors) - set(found.claims[0].effects)
 
 
+@pytest.mark.slow
 def test_the_same_on_the_independent_simulator(tmp_path: Path) -> None:
     parts = {}
     for loaded in (True, False):

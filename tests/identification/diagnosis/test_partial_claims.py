@@ -50,6 +50,7 @@ def test_laws_of_the_position_that_imitate_a_soft_stop_give_way_to_its_curve(
     assert curves == [["learned"]] * len(found.learned)
 
 
+@pytest.mark.slow
 def test_a_spring_that_does_most_of_a_soft_stop_is_like_it_and_in_part(tmp_path: Path) -> None:
     """Where the stop takes most of the travel; the curve beside it takes the rest."""
     found = improved(generate_case("soft_stop", 6005, folder=tmp_path / "case"))

@@ -34,6 +34,7 @@ DEMO = Path(str(files("workbench"))) / "demo"
 SLOW = ((0.07, 0.11), (0.15, 0.10), 0.8)
 
 
+@pytest.mark.slow
 def test_a_set_of_more_than_four_names_is_a_remainder_with_its_size() -> None:
     small = ((0.07, 0.11), (0.05, 0.03), 0.9)
     found = improve(record("loaded", 1, True, *small), JOINT, [record("held out", 2, True, *small)])

@@ -113,6 +113,7 @@ def improved(seed: int, sensors: str) -> tuple[Improvement, Record, Record]:
     return improve([train], joint, [test]), train, test
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "sensors", "name"),
     [
@@ -129,6 +130,7 @@ def test_clocks_are_asked_again_beside_what_is_missing(seed: int, sensors: str, 
     assert found.verdict == "complete"
 
 
+@pytest.mark.slow
 def test_a_comparison_has_the_clocks_that_the_loop_has() -> None:
     """They are asked again beside what is missing there, too."""
     found, train, test = improved(200002, "all")
@@ -140,7 +142,10 @@ def test_a_comparison_has_the_clocks_that_the_loop_has() -> None:
 
 @pytest.mark.parametrize(
     ("seed", "kind", "waits"),
-    [(435003, "single", 3.65), pytest.param(431007, "pair", 1.02, marks=pytest.mark.slow)],
+    [
+        pytest.param(435003, "single", 3.65, marks=pytest.mark.slow),
+        pytest.param(431007, "pair", 1.02, marks=pytest.mark.slow),
+    ],
 )
 def test_a_drive_later_than_a_clock_waits_for_a_part_and_is_filtered_for_the_rest(
     seed: int, kind: str, waits: float, tmp_path: Path

@@ -54,6 +54,7 @@ def test_a_scale_that_is_wrong_is_named_with_its_value(
     )
 
 
+@pytest.mark.slow
 def test_a_scale_that_leaves_no_stiffness_is_said(tmp_path: Path) -> None:
     folder = generate_case(None, 3, folder=tmp_path / "case")
     train, held = (

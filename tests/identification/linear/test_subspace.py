@@ -552,7 +552,9 @@ def joint_like(samples: int) -> tuple[FloatArray, FloatArray]:
     return u, np.tile(y, (repeats, 1))[:samples]
 
 
-@pytest.mark.parametrize("method", ["ordinary", "past_output"])
+@pytest.mark.parametrize(
+    "method", ["ordinary", pytest.param("past_output", marks=pytest.mark.slow)]
+)
 def test_a_hundred_thousand_samples_of_five_channels_take_50_mb(method: str) -> None:
     u, y = joint_like(100_000)
     tracemalloc.start()

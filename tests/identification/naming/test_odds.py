@@ -428,6 +428,7 @@ def test_a_drift_does_not_decide_between_two_names(tmp_path: Path) -> None:
     assert found.verdict == "complete"
 
 
+@pytest.mark.slow
 def test_a_name_that_takes_the_gear_for_the_motor_is_not_what_is_missing(tmp_path: Path) -> None:
     """Encoders of 12 bits, and a stiffness that rises with the twist: a torque of the motor that
     turns with it leaves a third of the RMS, as it takes the load and the noise off the gear, and

@@ -109,6 +109,7 @@ def test_the_front_holds_what_has_every_effect_of_the_joint(demo: Path) -> None:
     assert all(set(own["labels"]) <= set(labels) for labels in found["pareto"])
 
 
+@pytest.mark.slow
 def test_which_law_it_is_whole_fits_tell_and_not_the_price_of_its_parameters(
     tmp_path: Path,
 ) -> None:

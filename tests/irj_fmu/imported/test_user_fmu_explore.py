@@ -63,6 +63,7 @@ def test_what_is_hidden_is_recommended_and_on_the_front(path: Path, tmp_path: Pa
     assert "stribeck" in picture.read_text(encoding="utf-8").lower()
 
 
+@pytest.mark.slow
 def test_what_cannot_ride_outside_is_recommended_and_said(path: Path) -> None:
     """A gap of the gear: fitted by its outputs, the FMU has a spring that is far too soft."""
     found = explore(foreign(path), *halves("backlash", 3))
@@ -74,6 +75,7 @@ def test_what_cannot_ride_outside_is_recommended_and_said(path: Path) -> None:
     assert len(repr(found).splitlines()) <= 26
 
 
+@pytest.mark.slow
 def test_where_nothing_is_hidden_the_fmu_as_it_is_is_recommended(path: Path) -> None:
     found = explore(foreign(path), *halves(None, 4))
     assert found.found.recommended is found.found.start

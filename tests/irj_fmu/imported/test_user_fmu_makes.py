@@ -102,6 +102,7 @@ def test_an_array_is_named_by_its_elements(
     assert "name one element of it, y[1] to y[2]" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_fit_ends_where_it_ends_from_anywhere(tmp_path: Path) -> None:
     """From three tenths below every value it stopped 1.6 standard errors short, as its steps were
     used up on the weights of the residual that it began with.

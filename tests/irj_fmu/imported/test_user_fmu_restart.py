@@ -132,6 +132,7 @@ def test_a_kinematic_error_is_told_where_a_fit_without_it_left_the_fmu(path: Pat
     assert values["structural_damping"] == pytest.approx(TRUTH["structural_damping"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_sensor_gain_and_a_motor_constant_are_a_set_where_all_torques_are_free(
     path: Path,
 ) -> None:

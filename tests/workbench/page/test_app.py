@@ -734,6 +734,7 @@ def test_a_changed_record_begins_a_branch_and_the_fit_is_kept(client: Client) ->
     assert len(client.get(f"{where}/view/compare")["records"]) == 1
 
 
+@pytest.mark.slow
 def test_a_restart_finds_everything(tmp_path: Path) -> None:
     with serving(tmp_path) as there:
         client = Client(there.port)

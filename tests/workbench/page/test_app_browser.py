@@ -591,6 +591,7 @@ def test_an_upload_can_be_cancelled(served: Served, browser: Browser, tmp_path: 
 # --- what people do to a page ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fifty_quick_clicks_and_two_tabs(served: Served, browser: Browser) -> None:
     page = browser.page
     page.goto(served.address)

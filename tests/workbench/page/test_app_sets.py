@@ -69,8 +69,7 @@ def a_law_is_picked_from_a_learned_curve(page: Any) -> None:
     ("name", "most"),
     [
         ("emps", 8),
-        ("kuka_axis1", 12),
-        *(pytest.param(n, 12, marks=pytest.mark.slow) for n in ("quanser", "hebi")),
+        *(pytest.param(n, 12, marks=pytest.mark.slow) for n in ("kuka_axis1", "quanser", "hebi")),
     ],
 )
 def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: int) -> None:

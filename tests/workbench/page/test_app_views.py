@@ -266,9 +266,9 @@ def test_spare_work_gives_way_and_other_work_keeps_its_order() -> None:
     [
         ("diagnose", {}),
         ("improve", {}),
-        ("plan", {}),
+        pytest.param("plan", {}, marks=pytest.mark.slow),
         ("replay", {"file": ""}),
-        ("report", {}),
+        pytest.param("report", {}, marks=pytest.mark.slow),
     ],
 )
 def test_long_work_says_how_far_it_is_and_ends_when_cancelled(
