@@ -103,7 +103,7 @@ def test_answers_that_come_late_lose_no_view(opened: Opened) -> None:
         " return answer; }; }"
     )
     row = page.locator("main table tr", has_text="motor coulomb").first
-    for _ in range(2):  # hold, release
+    for _ in range(4):  # hold, release, hold, release
         joint, held = page.evaluate("app.state.joint_text"), "held" in row.inner_text()
         page.click("#hold-motor_coulomb")
         page.wait_for_function("was => app.state.joint_text !== was", arg=joint)
