@@ -5,7 +5,7 @@ runs; every guess is written beside what it decides.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
@@ -64,6 +64,7 @@ def first_joint(
     joint: Joint | None = None,
     *,
     folder: Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> str:
     """The text of a joint file whose model is an FMU.
 
@@ -77,6 +78,8 @@ def first_joint(
         Gear ratio and motor constant where they are known.
     folder : Path, optional
         Where the file goes, see :func:`irj_fmu.imported.file.fmu_named`.
+    progress : callable, optional
+        ``progress(text, share)`` before each variable of the FMU is moved, for which it runs.
 
     Raises
     ------
@@ -110,7 +113,8 @@ def first_joint(
             "[model.channels] by hand"
         )
     _run(fmu, kind, [m[0] for m in outputs.values()])
-    _starts(draft, fmu, kind, outputs, [*named["local"], *named["parameter"]])
+    moved = [*named["local"], *named["parameter"]]
+    _starts(draft, fmu, kind, outputs, _each_told(moved, progress or (lambda text, share: None)))
     _parameters(draft, named["parameter"])
     return _text(draft, fmu_named(fmu.path, folder), kind, known, why)
 
@@ -213,12 +217,20 @@ def _units(unit: str | None, wanted: str) -> tuple[float | None, str]:
     return own.factor / given.factor, ""
 
 
+def _each_told(variables: Sequence[Any], progress: Callable[[str, float], None]) -> Iterator[Any]:
+    """The variables, each told before it is moved."""
+    for k, v in enumerate(variables):
+        progress(f"what {v.name} starts"[:40], k / len(variables))
+        yield v
+    progress("done", 1.0)
+
+
 def _starts(
     draft: _Draft,
     fmu: UserFmu,
     kind: Kind,
     outputs: Mapping[str, tuple[str, float, str]],
-    variables: Sequence[Any],
+    variables: Iterable[Any],
 ) -> None:
     """Find the start values of positions and velocities by what they do: each is moved, and the
     FMU runs for two samples.

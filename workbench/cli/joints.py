@@ -8,7 +8,7 @@ from pathlib import Path
 
 from identification.data.joint_library import Entry, chosen, entries, packaged, side_by_side
 from identification.errors import InputError
-from workbench.cli.files import open_joint, open_records, write_json, write_text
+from workbench.cli.files import open_joint, open_records, progress_bar, write_json, write_text
 
 
 def run_joints(arguments: Namespace) -> int:
@@ -82,7 +82,7 @@ def run_joint(arguments: Namespace) -> int:
     records, _ = open_records([arguments.record], known)
     try:
         folder = Path(arguments.output).parent if arguments.output else None
-        text = first_joint(arguments.fmu, records[0], known, folder=folder)
+        text = first_joint(arguments.fmu, records[0], known, folder=folder, progress=progress_bar)
     except FmuError as error:
         raise InputError(str(error)) from error
     guesses = [line for line in text.splitlines() if "#" in line]

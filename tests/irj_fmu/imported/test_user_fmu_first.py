@@ -105,3 +105,16 @@ def test_an_fmu_without_a_recorded_output_is_refused(tmp_path: Path) -> None:
     fmu = build("Dahlquist", tmp_path, Make(2))
     with pytest.raises(InputError, match="no output goes with a channel of axis"):
         first_joint(fmu, axis(seconds=1.0))
+
+
+def test_how_far_it_is_is_told_for_each_variable_that_is_moved(tmp_path: Path) -> None:
+    fmu = build("Axis", tmp_path, Make(2, ("CoSimulation",)))
+    told: list[tuple[str, float]] = []
+    text = first_joint(
+        fmu, axis(seconds=1.0), progress=lambda text, share: told.append((text, share))
+    )
+    assert text == first_joint(fmu, axis(seconds=1.0))
+    assert told[-1] == ("done", 1.0)
+    assert len(told) > 3
+    assert all(line.startswith("what ") for line, _ in told[:-1])
+    assert [share for _, share in told] == sorted(share for _, share in told)
