@@ -72,7 +72,10 @@ def test_another_notation_is_the_same_joint(
 
 
 @pytest.mark.parametrize("name", [*HIDDEN, *RECORDED])
-@pytest.mark.parametrize("transform", ["positions in deg", "positions in rev"])
+@pytest.mark.parametrize(
+    "transform",
+    ["positions in deg", pytest.param("positions in rev", marks=pytest.mark.slow)],
+)
 def test_units_change_no_parameter_of_any_joint(name: str, transform: str, tmp_path: Path) -> None:
     """Rounding decides nothing: no turn at rest, no step of an encoder, no sample as calm."""
     case = short(name)

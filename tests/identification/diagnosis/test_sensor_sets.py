@@ -97,7 +97,7 @@ def test_coulomb_friction_is_named(given: tuple[str, ...]) -> None:
     assert {c.effects for c in found.claims if len(c.effects) == 1} == {("coulomb",)}
 
 
-@pytest.mark.parametrize("hidden", [(), ("quadratic_drag",)])
+@pytest.mark.parametrize("hidden", [(), pytest.param(("quadratic_drag",), marks=pytest.mark.slow)])
 def test_what_a_coarse_encoder_hides_is_seen_in_longer_rows(hidden: tuple[str, ...]) -> None:
     """With the encoder the answer was that nothing is missing, and without it the law was found."""
     given, step = ("current", "motor", "link"), 2 * math.pi / 2**12
