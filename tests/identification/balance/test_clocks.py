@@ -110,6 +110,7 @@ def test_a_skew_is_in_the_joint_file_and_on_the_page_and_is_no_effect() -> None:
     assert not any("skew" in n for n in found.as_json()["steps"][-1]["parameters"])
 
 
+@pytest.mark.slow
 def test_a_delay_beyond_a_logger_is_claimed_whole() -> None:
     samples = round(MOST_SKEW) + 5
     found = demo("link_torque", samples)

@@ -59,7 +59,8 @@ def test_a_loop_of_the_torsion_is_seen_whichever_encoder_is_the_finer(
     assert found.values["hysteresis_width"] == pytest.approx(1e-4, rel=0.02)
 
 
-@pytest.mark.parametrize("seed", [209004, pytest.param(210001, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [209004, 210001])
 def test_a_loop_of_another_bend_is_followed_to_its_noise(seed: int, tmp_path: Path) -> None:
     """Elements as far apart as 1, 3 and 9 left 1.8 and 1.9 times the noise of these loops."""
     case = make_case(seed, names=("hysteresis",), size=1.0)

@@ -312,6 +312,7 @@ def test_the_loop_marks_names_that_imitate_another_law(law: Law) -> None:
     assert all("like" in c.as_json() for c in found.claims)
 
 
+@pytest.mark.slow
 def test_what_only_a_name_like_a_law_asks_for_is_a_part_of_that_law() -> None:
     """A knee over the position is a spring, gravity and a gap together; beside a curve over the
     position no gap is asked for. It is marked so where it is one name; with a soft wind-up, which

@@ -177,6 +177,7 @@ def test_records_are_prepared_where_the_fit_is_refused(monkeypatch: pytest.Monke
     assert [w.shifts for w in made.train] == [w.shifts for w in read_so.train]
 
 
+@pytest.mark.slow
 def test_the_library_is_tried_once_on_the_start_model(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

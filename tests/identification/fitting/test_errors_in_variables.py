@@ -351,6 +351,7 @@ def test_the_equations_of_a_fit_hold_where_a_trial_starts() -> None:
     assert meeting == pytest.approx(pulled, abs=1e-6 * float(np.abs(pulled).max()))
 
 
+@pytest.mark.slow
 def test_a_law_beside_encoders_of_twelve_bits_is_named(tmp_path: Path) -> None:
     """By plain least squares laws led that let the inertia of the link be another, which passes
     less noise on, and the hidden hysteresis was none of the first five.

@@ -77,6 +77,7 @@ def test_a_scale_that_leaves_no_stiffness_is_said(tmp_path: Path) -> None:
     assert not any("the stiffness went to zero" in w for w in right.warnings)
 
 
+@pytest.mark.slow
 def test_no_scale_is_named_where_none_is_wrong(tmp_path: Path) -> None:
     folder = generate_case("cubic_stiffness", 3, folder=tmp_path / "case")
     train, held = ([read(folder / f"{n}{i}.csv") for i in ("", "2")] for n in ("train", "test"))

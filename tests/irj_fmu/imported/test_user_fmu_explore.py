@@ -33,6 +33,7 @@ def halves(hidden: str | None, seed: int) -> tuple[Record, Record]:
     return record.window(0, 6), record.window(6, 9)
 
 
+@pytest.mark.slow
 def test_what_is_hidden_is_recommended_and_on_the_front(path: Path, tmp_path: Path) -> None:
     """From the command line, with every file that it writes."""
     for name, part in zip(("train", "held"), halves("stribeck", 3), strict=True):

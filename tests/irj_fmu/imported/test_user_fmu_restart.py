@@ -83,6 +83,7 @@ def test_a_kinematic_error_is_named_and_nothing_beside_it(path: Path) -> None:
         found.add()
 
 
+@pytest.mark.slow
 def test_a_loop_of_the_gear_is_told_where_a_fit_without_it_left_the_fmu(path: Path) -> None:
     """Fitted by its outputs alone, the FMU has three times the damping and an inertia that is off:
     three steps from there left 20 times the floor, and two names that are none.

@@ -655,6 +655,7 @@ def test_fifty_quick_clicks_do_the_work_once(client: Client) -> None:
     assert state["error"] is None
 
 
+@pytest.mark.slow
 def test_two_sessions_do_not_disturb_each_other(client: Client) -> None:
     first, second = client.session(), client.session()
     for where in (first, second):

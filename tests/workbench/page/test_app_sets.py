@@ -68,8 +68,9 @@ def a_law_is_picked_from_a_learned_curve(page: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "most"),
     [
-        ("emps", 8),
-        *(pytest.param(n, 12, marks=pytest.mark.slow) for n in ("kuka_axis1", "quanser", "hebi")),
+        ("kuka_axis1", 12),
+        pytest.param("emps", 8, marks=pytest.mark.slow),
+        *(pytest.param(n, 12, marks=pytest.mark.slow) for n in ("quanser", "hebi")),
     ],
 )
 def test_the_page_says_what_the_terminal_says(tmp_path: Path, name: str, most: int) -> None:
