@@ -75,6 +75,7 @@ def test_stiffness_is_of_the_right_order_or_said_not_to_be_told(axis: int, owner
     assert error < 0.5 * solution.values["stiffness"]
 
 
+@pytest.mark.slow
 def test_gravity_is_named_on_axes_two_and_three_and_coulomb_friction_on_one() -> None:
     assert improved(1).claims[0].effects[0] == "coulomb"
     for axis in (2, 3):

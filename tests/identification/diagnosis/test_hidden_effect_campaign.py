@@ -111,9 +111,9 @@ def test_a_relative_is_not_added_beside_the_wrong_name_of_a_set(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("seed", "dirt"),
     [
-        pytest.param(4002, False, marks=pytest.mark.slow),
+        (4002, False),
         pytest.param(4003, False, marks=pytest.mark.slow),
-        (4004, True),
+        pytest.param(4004, True, marks=pytest.mark.slow),
     ],
 )
 def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, dirt: bool) -> None:

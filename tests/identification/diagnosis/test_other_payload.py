@@ -132,7 +132,8 @@ def test_a_set_on_loaded_records_and_the_gain_after_an_unloaded_run(seed: int) -
     )
 
 
-@pytest.mark.parametrize("seed", [10, pytest.param(13, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [10, 13])
 def test_a_law_that_passes_less_noise_on_is_not_the_more_probable_one(seed: int) -> None:
     """A gain scales the noise of what it stands at: its residual is longer and no worse."""
     slow = ((0.07, 0.11), (0.15, 0.10), 0.8)

@@ -98,7 +98,8 @@ def test_a_loop_of_the_gear_is_told_where_a_fit_without_it_left_the_fmu(path: Pa
     assert max(ratios[b].ratio for b in ("motor", "link")) < 1.2
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(71, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 71])
 def test_the_damping_beside_a_loop_of_the_gear_is_that_of_the_gear(path: Path, seed: int) -> None:
     """The noise of the positions made the loop grow with speed; the damping was 8 and 6 % low, by
     five and six of its errors.

@@ -202,6 +202,7 @@ def test_what_is_known_is_given_changed_and_taken_back_on_the_model_page(page: A
     assert joint(page).get("known", {}) == known
 
 
+@pytest.mark.slow
 def test_no_view_has_a_finding_of_any_level(page: Any) -> None:
     """In light and dark, wide and on a phone, with everything unfolded."""
     if not page.evaluate("app.state.steps.length"):

@@ -228,6 +228,7 @@ def test_a_unit_of_the_other_kind_of_axis_says_which_kind(tmp_path: Path) -> Non
         read(path, columns=columns)
 
 
+@pytest.mark.slow
 def test_the_reading_of_the_drive_has_the_name_of_its_channel(pair: tuple[Record, Record]) -> None:
     def named(record: Record) -> Record:
         channels: dict[str, Any] = dict(record.channels)

@@ -48,6 +48,7 @@ HARDEST = (
 """What an engineer's machine does by itself, in every run of the tests."""
 
 
+@pytest.mark.slow
 def test_no_kill_and_no_full_disk_loses_a_fit(tmp_path: Path) -> None:
     """The process of the work is killed and its end is one sentence; the server is killed and what
     ran is taken up again.
