@@ -1173,12 +1173,13 @@ class Session:
                 model, {**known, **new, **before.solution.values}, again=True
             )
             after = self.bench.step(claim.effects[0], claim.label, solution)
-            kept.append(
-                replace(
-                    claim,
-                    held_out_drop_percent=held_drop(before.held_out, after.held_out, claim.balance),
-                )
+            # what a name does to longer rows, these do not say
+            fall = (
+                held_drop(before.held_out, after.held_out, claim.balance)
+                if claim.kernel is None
+                else claim.held_out_drop_percent
             )
+            kept.append(replace(claim, held_out_drop_percent=fall))
             out.append(after)
         return _Standing(tuple(out), tuple(kept))
 

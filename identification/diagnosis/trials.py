@@ -35,12 +35,13 @@ from identification.fitting.errors_in_variables.products import (
     SURE_STEP,
     DrawnRows,
     certain,
+    each_drawn,
     moved_rows,
-    rows_drawn,
     shares,
 )
 from identification.fitting.signed_fit import inverse, projected_gain, signed_fit
 from identification.fitting.start_values import bounds_of
+from identification.fitting.weak_form import bending
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -387,9 +388,9 @@ def _noise_of(base: Base, left: FloatArray) -> Noise | None:
     solution, data = base.solution, base.data
     names = [*base.names, *base.inward_names]
     balances = balances_of(solution.model, data.sensing, wrt=bare(names))
-    drawn = rows_drawn(data, lambda w, _: stack(balances, [w], solution.values, names))
+    drawn = each_drawn(data, lambda w, _: stack(balances, [w], solution.values, names))
     believed = noise_believed(solution.model, data, solution.values)
-    bent = _sizes(solution)
+    bent = bending(solution.model)
     norms = np.concatenate([base.norms, base.inward_norms])
     scale = np.append(np.where([n in bent for n in names], 0.0, 1 / norms), 1.0)
     moved = {b: x * scale for b, x in base.moved(drawn, believed).items()}
@@ -421,7 +422,7 @@ def _unseen_sizes(
 
     A step along such a column is of any length, and other records may show it.
     """
-    sizes = _sizes(solution)
+    sizes = bending(solution.model)
     return np.array(
         [
             n in sizes and abs(solution.values[n]) * norm < UNSEEN
@@ -429,12 +430,6 @@ def _unseen_sizes(
         ],
         dtype=bool,
     )
-
-
-def _sizes(solution: Solution) -> set[str]:
-    """Shapes and smoothing velocities: they bend the columns, where first order does not hold."""
-    model = solution.model
-    return {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
 
 
 def span_of(columns: FloatArray) -> FloatArray:
@@ -702,7 +697,7 @@ def _score(
         more = signed_fit(train[:-1, :-1], -train[:-1, -1], lows, p, total[:-1, :-1])
         sse1[test] = _quadratic(grams[test], np.concatenate([more, [1.0]]))
     delta = signed_fit(total[:-1, :-1], -total[:-1, -1], lows, p)
-    amplitude = delta[own:] / size
+    there, amplitude = np.append(delta, 1.0), delta[own:] / size
     if not np.any(amplitude):
         return None
     told = _told(base, sse1)
@@ -720,7 +715,7 @@ def _score(
         delta=delta,
         size=size,
         where=where,
-        added=0.0 if noise is None else _quadratic_of(noise[where], delta),
+        noise=0.0 if noise is None else float(there @ noise[where] @ there),
     )
     contribution = float(np.sqrt(np.mean((raw[base.balance == where] @ amplitude) ** 2)))
     gains = _gains(base, sse1 / unit**2)
@@ -754,7 +749,7 @@ def noise_beside(
     names = candidate.amplitudes
     balances = balances_of(candidate.model, base.data.sensing, wrt=names, columns_only=True)
     values = _without_it(candidate, base, shapes)
-    drawn = rows_drawn(base.data, lambda w, _: stack(balances, [w], values))
+    drawn = each_drawn(base.data, lambda w, _: stack(balances, [w], values))
     moved = base.moved(drawn, noise.believed)
     return noise.products({b: x[:, :-1] / size for b, x in moved.items()})
 
@@ -907,12 +902,6 @@ def _bordered(base: Base, added: FloatArray) -> FloatArray:
     return out
 
 
-def _quadratic_of(gram: FloatArray, delta: FloatArray) -> float:
-    """Value of a form at a step of all columns."""
-    there = np.append(delta, 1.0)
-    return float(there @ gram @ there)
-
-
 def _quadratic(grams: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.einsum("kbij,i,j->kb", grams, vector, vector), 0.0))
 
@@ -925,10 +914,10 @@ def _held_out_drop(
     delta: FloatArray,
     size: FloatArray,
     where: int,
-    added: float,
+    noise: float,
 ) -> float:
-    """Fall of the RMS of a balance on records that the fit never saw, in percent; `added`: what
-    noise in the columns adds to the squares of its training rows.
+    """Fall of the RMS of a balance on records that the fit never saw, in percent; `noise`: what it
+    adds through the columns to the squares of the training rows.
     """
     if not len(base.held_residual):
         return math.nan
@@ -949,8 +938,8 @@ def _held_out_drop(
     before, after = (x - base.held_own @ (base.held_own.T @ x) for x in (before, after))
     before, after = before[here], after[here]
     theirs, ours = base.held_weight[here], base.weight[base.balance == where]
-    added *= float(theirs @ theirs) / max(float(ours @ ours), 1e-300)
-    left = max(float(after @ after) - added, 0.0)
+    noise *= float(theirs @ theirs) / max(float(ours @ ours), 1e-300)
+    left = max(float(after @ after) - noise, 0.0)
     return 100 * (1 - math.sqrt(left / max(float(before @ before), 1e-300)))
 
 

@@ -44,6 +44,15 @@ def memory_shapes_of(model: JointModel, free: Sequence[str]) -> tuple[str, ...]:
     return tuple(out)
 
 
+def bending(model: JointModel) -> frozenset[str]:
+    """Parameters that bend the rows, where first order does not hold: shapes and smoothing
+    velocities.
+    """
+    return frozenset(
+        {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
+    )
+
+
 @final
 @dataclass(frozen=True)
 class WeakForm:
@@ -125,9 +134,8 @@ class WeakForm:
 
     @cached_property
     def bent(self) -> npt.NDArray[np.bool_]:
-        """Which of the free parameters bend the rows: shapes and smoothing velocities."""
-        model = self.balances.model
-        names = {p.name for p in model.parameters if p.is_shape} | set(model.named("smoothing"))
+        """Which of the free parameters bend the rows."""
+        names = bending(self.balances.model)
         return np.array([n in names for n in self.free], dtype=bool)
 
     @cached_property

@@ -98,10 +98,10 @@ def drawn_rows(
         seen = drawn if read is None else read(drawn, record)
         return stack(problem.balances, [seen], problem.values, problem.free)
 
-    return rows_drawn(problem.data, rows)
+    return each_drawn(problem.data, rows)
 
 
-def rows_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked]) -> DrawnRows:
+def each_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked]) -> DrawnRows:
     """What is made of each training record without and with drawn noise."""
     return [
         [(rows(d.calm, record), rows(d.noisy, record)) for d in draws_of(record, data.sources)]
@@ -257,10 +257,10 @@ __all__ = [
     "Unbiased",
     "certain",
     "drawn_rows",
+    "each_drawn",
     "moved_rows",
     "no_noise",
     "noise_products",
-    "rows_drawn",
     "shares",
     "whole_without",
 ]

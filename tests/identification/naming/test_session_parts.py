@@ -26,7 +26,7 @@ from identification.diagnosis.improvement import Improvement, Step, made_worse
 from identification.diagnosis.learned import Doubt, Equivalence
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.outcome import key_of
-from identification.diagnosis.session import Session, _behind
+from identification.diagnosis.session import Session, _behind, _Standing
 from identification.diagnosis.trials import Base, Trial, make_base
 from identification.fitting.assess import RATIO_LIMIT, BalanceError, Error
 from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
@@ -390,6 +390,18 @@ def test_longer_rows_tell_what_the_noise_of_short_ones_hides(
     assert claim.effects == ("quadratic_drag",)
     assert claim.kernel == length
     assert found.verdict == ("unexplained" if short else "complete")
+
+
+def test_what_a_name_does_to_longer_rows_stays_where_the_steps_are_made_again(base: Base) -> None:
+    laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}}
+    short = World(base, {"p": HIDDEN_BY_NOISE}, laws)
+    session = Session(short)
+    start = short.step(None, None, short.start())
+    claim = Claim(("quadratic_drag",), "quadratic_drag@motor", "axis", 66.0, kernel=0.12)
+    again = session._replay([claim], _Standing((start,), ()))
+    assert [c.held_out_drop_percent for c in again.claims] == [66.0]
+    shorter = session._replay([replace(claim, kernel=None)], _Standing((start,), ()))
+    assert shorter.claims[0].held_out_drop_percent == pytest.approx(4.7, abs=0.1)
 
 
 @pytest.mark.parametrize("named_there", [True, False])
