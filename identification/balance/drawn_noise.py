@@ -56,6 +56,7 @@ class Draw:
     rows : (n,) int array
         Rows of the whole record that these are.
     calm, noisy : WeakRecord
+        All draws of a record have the same calm one.
     """
 
     record: WeakRecord
@@ -89,8 +90,10 @@ def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Dra
         return found[1]
     rng = np.random.default_rng(SEED)
     seen, rows = excerpt(record)
+    calm = replace(seen, points={**seen.points, **seen.smooth})
     made = tuple(
-        _drawn(seen, rows, noise, rng) for _ in range(max(1, -(-ROWS // max(seen.rows, 1))))
+        Draw(seen, rows, calm, noisy=_with_noise(calm, noise, rng))
+        for _ in range(max(1, -(-ROWS // max(seen.rows, 1))))
     )
     cache[key] = (weakref.ref(record), made)
     while len(cache) > MOST:
@@ -171,9 +174,10 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
     return pieces, which
 
 
-def _drawn(
-    record: WeakRecord, rows: IntArray, noise: Mapping[str, ChannelNoise], rng: np.random.Generator
-) -> Draw:
+def _with_noise(
+    record: WeakRecord, noise: Mapping[str, ChannelNoise], rng: np.random.Generator
+) -> WeakRecord:
+    """A record, its points smoothed already, with drawn noise on top of it."""
     grid = record.grid
     count = max((s.stop for s in grid.segments), default=0)
     present = [
@@ -190,19 +194,13 @@ def _drawn(
             drawn[c] = drawn[c] + record.bridging[c][:count] * rng.standard_normal(count)
     averaged, points, smooth, curved = filtered(grid, drawn, curved=bool(record.curved))
     also = paired(grid, {c: drawn.get(c, np.zeros(count)) for c in record.paired})
-    calm = replace(record, points={**record.points, **record.smooth})
-    return Draw(
+    return replace(
         record,
-        rows,
-        calm=calm,
-        noisy=replace(
-            record,
-            averaged=_plus(record.averaged, averaged),
-            points=_plus(calm.points, points),
-            smooth=_plus(record.smooth, smooth),
-            paired=_plus(record.paired, also),
-            curved=_plus(record.curved, curved),
-        ),
+        averaged=_plus(record.averaged, averaged),
+        points=_plus(record.points, points),
+        smooth=_plus(record.smooth, smooth),
+        paired=_plus(record.paired, also),
+        curved=_plus(record.curved, curved),
     )
 
 

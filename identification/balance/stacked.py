@@ -227,8 +227,8 @@ def _drawn_floors(
     seen = drawn[0].record
     either = unsure(balances, data, values, [seen])
     values = values_on(balances.model, record, values)
+    calm = balances.evaluate(drawn[0].calm, values, remembered=seen)
     for draw in drawn:
-        calm = balances.evaluate(draw.calm, values, remembered=seen)
         noisy = balances.evaluate(draw.noisy, values)
         for b in power:
             rows = seen.taking(b)
@@ -394,12 +394,14 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     level = float(np.median(np.abs(change))) / NORMAL_MEDIAN
     if level <= 0 or not np.any(either):
         return rms(change)
+    either = np.minimum(either, NOTHING_SURE)
     for _ in range(WEIGHINGS):
         # from the surest row: where a law ran away the square of each alone may be nothing
-        unsure_by = np.hypot(level, np.minimum(either, NOTHING_SURE))
+        unsure_by = np.hypot(level, either)
         weight = float(unsure_by.min()) / unsure_by
-        level = rms(change * weight) / rms(weight)
-        if not math.isfinite(level):
+        weighted, before = change * weight, level
+        level = math.sqrt(float(weighted @ weighted) / float(weight @ weight))
+        if level == before or not math.isfinite(level):
             break
     return level
 
@@ -649,4 +651,5 @@ def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> np
 
 def rms(values: FloatArray) -> float:
     """Root mean square."""
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+    flat = values.ravel()
+    return math.sqrt(float(flat @ flat) / flat.size) if flat.size else 0.0

@@ -16,7 +16,6 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from casadi_models.signals import one_line
 from identification.balance.colour import ChannelNoise
@@ -213,6 +212,15 @@ ROUNDED: Final = 1e-14
 """The same of a derivative: weights of a kernel fall off, so that some tens of terms count."""
 
 
+def _windows(values: FloatArray, length: int) -> FloatArray:
+    """All windows of that many samples, (windows, length), over the memory of the values: as the
+    view of numpy, which takes longer to make than a short record takes to be filtered.
+    """
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    apart = values.itemsize
+    return np.ndarray((len(values) - length + 1, length), np.float64, values, 0, (apart, apart))
+
+
 def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray:
     """Products of some windows with the weights, a stretch at a time: copies of all windows at once
     would not stay in the cache.
@@ -246,7 +254,7 @@ def _strided(
     for segment in segments:
         x = values[segment]
         rows = np.arange(half, len(x) - half, stride)
-        parts.append(_at(sliding_window_view(x, len(weights)), rows - own, weights))
+        parts.append(_at(_windows(x, len(weights)), rows - own, weights))
     return np.concatenate(parts) if parts else np.empty(0)
 
 
@@ -675,7 +683,7 @@ def _pointwise(
     raw, soft = [], []
     for segment in segments:
         x = values[segment]
-        inner = sliding_window_view(x, len(weights))[::1]
+        inner = _windows(x, len(weights))
         centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
         filtered = _at(inner, centres, weights)
         soft.append(filtered)

@@ -103,10 +103,12 @@ def drawn_rows(
 
 def each_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked]) -> DrawnRows:
     """What is made of each training record without and with drawn noise."""
-    return [
-        [(rows(d.calm, record), rows(d.noisy, record)) for d in draws_of(record, data.sources)]
-        for record in data.train
-    ]
+    found: DrawnRows = []
+    for record in data.train:
+        draws = draws_of(record, data.sources)
+        calm = rows(draws[0].calm, record)
+        found.append([(calm, rows(d.noisy, record)) for d in draws])
+    return found
 
 
 def noise_products(
