@@ -740,17 +740,19 @@ class Session:
         """The steps with a name that only rows of a longer kernel show; None where there is none.
 
         Asked once of a model, where nothing else is left to claim, and of the balances that stand
-        over their floor there alone: what short rows show their noise does not hide.
+        over their floor there alone: what short rows show their noise does not hide. A set is asked
+        on still longer rows, too: noise that makes names alike is less there.
         """
         now = standing.now.solution
         if now.model.structure in self._asked:
             return None
         self._asked.add(now.model.structure)
         shown = _standing_over(standing.now)
+        longer: _Standing | None = None
         for factor in SLOWER:
             bench = self.bench.slower(factor)
             if bench is None:
-                return None
+                break
             if not _standing_over(bench.step(None, None, now)) - shown:  # its own fit leaves less
                 continue
             slow = bench.fitted(now.model, now.values, again=True)
@@ -769,6 +771,7 @@ class Session:
                 or len(found.claims[0].effects) > LARGEST_SET
                 # a whole fit has no linear form to allow for, and these are further looks
                 or found.claims[0].held_out_drop_percent < MAJOR_DROP
+                or (longer and not set(found.claims[0].effects) < set(longer.claims[-1].effects))
             ):
                 continue
             claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
@@ -780,8 +783,10 @@ class Session:
             # by how much the short rows fall or rise is their noise
             if spoilt(standing.now.held_out, after.held_out):
                 continue
-            return _Standing((*standing.steps, after), (*standing.claims, claim))
-        return None
+            longer = _Standing((*standing.steps, after), (*standing.claims, claim))
+            if len(claim.effects) == 1:
+                break
+        return longer
 
     def _fewer(
         self, best: Trial, claim: Claim, ranking: Ranking, base: Base, now: Step

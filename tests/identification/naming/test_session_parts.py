@@ -358,6 +358,7 @@ def test_a_set_of_too_many_is_forgotten_where_a_later_law_takes_its_work_along(b
 
 # --- rows of a longer kernel ----------------------------------------------------------------------
 
+NOTHING: dict[str, Shares] = {"quadratic_drag": {}, "gravity": {}}
 HIDDEN_BY_NOISE = 0.1
 """Power of a part that stands in the noise of short rows: they fall by 5 %."""
 
@@ -390,6 +391,33 @@ def test_longer_rows_tell_what_the_noise_of_short_ones_hides(
     assert claim.effects == ("quadratic_drag",)
     assert claim.kernel == length
     assert found.verdict == ("unexplained" if short else "complete")
+
+
+@pytest.mark.parametrize(
+    ("longest", "names", "length"),
+    [
+        ({"quadratic_drag": {"p": 1.0}, "gravity": {"p": 0.5}}, {"quadratic_drag"}, 0.24),
+        ({**NOTHING, "stribeck": {"p": 1.0}}, {"quadratic_drag", "gravity"}, 0.12),
+        (NOTHING, {"quadratic_drag", "gravity"}, 0.12),
+    ],
+    ids=["told apart there", "another name there", "no name there"],
+)
+def test_a_set_of_longer_rows_is_asked_on_still_longer_ones(
+    longest: dict[str, Shares], names: set[str], length: float, base: Base
+) -> None:
+    alike: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}, "gravity": {"p": 1.0}}
+    laws = {"stribeck": {}, **alike}
+    worlds = {}
+    for factor, there in ((2.0, laws), (4.0, longest)):
+        long = worlds[factor] = World(base, {"p": 8.0}, there)
+        (w,) = long.data.train
+        long.data = replace(
+            long.data, train=(replace(w, grid=replace(w.grid, length=0.06 * factor)),)
+        )
+    found = ended(World(base, {"p": HIDDEN_BY_NOISE}, laws, longer=worlds))
+    claim = found.claims[0]
+    assert set(claim.effects) == names
+    assert claim.kernel == length
 
 
 def test_what_a_name_does_to_longer_rows_stays_where_the_steps_are_made_again(base: Base) -> None:
