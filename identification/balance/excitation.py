@@ -18,6 +18,9 @@ FloatArray = npt.NDArray[np.float64]
 
 ATTENUATION: Final = 0.02
 """Pull of a parameter towards zero that is worth a word."""
+HIDDEN: Final = 90.0
+"""Per cent of it from which on what is left is no more than the error of the noise, which a minute
+of rows knows within a tenth."""
 
 FEWEST_REVERSALS: Final = 4
 """Reversals of the motor below which the training records say little about friction."""
@@ -123,8 +126,17 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
         for name, share in attenuation(data).items()
         if share > ATTENUATION
     }
-    if pulled:
-        worst = ", ".join(f"{name} by about {share:.2g} %" for name, share in pulled.items())
+    hidden = [name for name, percent in pulled.items() if percent >= HIDDEN]
+    if hidden:
+        whole = " and the ".join(hidden)
+        out.append(
+            f"noise of the positions hides the {whole}: these accelerations tell next to nothing "
+            "of it; move faster, or read finer encoders"
+        )
+    worst = ", ".join(
+        f"{name} by about {percent:.2g} %" for name, percent in pulled.items() if name not in hidden
+    )
+    if worst:
         out.append(
             f"noise of the positions would lower the {worst}: the fit takes that off as far as the "
             "noise is white, finer encoders avoid it"

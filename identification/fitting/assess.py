@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.balance.balances import balances_of
+from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import settled
 from identification.balance.kinematic import residual_unit
 from identification.balance.stacked import (
@@ -33,7 +33,7 @@ from identification.fitting.engine import (
     stack,
     taking_part,
 )
-from identification.fitting.left_open import LeftOpen
+from identification.fitting.left_open import LeftOpen, Step
 from identification.fitting.turns import Turns, turns_of
 
 FloatArray = npt.NDArray[np.float64]
@@ -183,6 +183,17 @@ def _powers(
     }
 
 
+def _weights(
+    balances: Balances,
+    data: Dataset,
+    values: Mapping[str, float],
+    floor: Mapping[str, FloatArray],
+    records: Sequence[WeakRecord],
+) -> dict[str, FloatArray]:
+    least = {b: np.maximum(x, LEAST_DEVIATION) for b, x in floor.items()}
+    return dict(row_weights(balances, data, values, least, records))
+
+
 def assess(
     model: JointModel,
     data: Dataset,
@@ -202,11 +213,18 @@ def assess(
     believed = noise_believed(model, data, values)
     quick, drift = noise_rows(model, data, values, records)
     floor = together(quick, drift, records)
-    wide = row_weights(
-        balances, data, values, {b: np.maximum(floor[b], LEAST_DEVIATION) for b in floor}, records
-    )
+    wide = _weights(balances, data, values, floor, records)
+    steps: dict[str, Step] = {}
+    if left_open is not None:
+        steps = left_open.steps(data, records, values, wide)
+        # noise passes a parameter that is open, too: the floor is that of where the step leads
+        for b, step in steps.items():
+            there = noise_rows(model, data, step.values, records)
+            quick[b], drift[b] = (part[b] for part in there)
+            own = together(*there, records)
+            floor[b], wide[b] = own[b], _weights(balances, data, step.values, own, records)[b]
+        steps = left_open.steps(data, records, values, wide)
     weights = {b: w[rows[b]] for b, w in wide.items()}
-    steps = left_open.steps(data, records, values, wide) if left_open is not None else {}
     beside = {b: whole[b] + steps[b].moved if b in steps else whole[b] for b in whole}
     turning = partial(turns_of, balances, records, values)
     prices = {b: steps[b].price / max(int(rows[b].sum()), 1) if b in steps else 0.0 for b in whole}

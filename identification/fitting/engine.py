@@ -613,15 +613,15 @@ def _with_errors(
         ]
         high = [values[free[k]] >= limits[free[k]][1] for k in held]
         wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)
+        wider = np.hypot(wider / norms[index], without.left[index])
         spread, corr = correlations(part.gram)
         corr[:, [is_of_run(free[i]) for i in index.tolist()]] = 0.0
         for k, i in enumerate(index.tolist()):
-            stderr[free[i]] = (
-                None if size is None else math.hypot(float(size[k]), float(wider[k] / norms[i]))
-            )
+            stderr[free[i]] = None if size is None else math.hypot(float(size[k]), float(wider[k]))
             other = int(np.argmax(np.abs(corr[k])))
             correlation[free[i]] = (free[int(index[other])], float(corr[k, other]))
-            weak = size is not None and values[free[i]] != 0 and size[k] > abs(values[free[i]])
+            error = stderr[free[i]]
+            weak = error is not None and values[free[i]] != 0 and error > abs(values[free[i]])
             if (
                 (spread[k] > COLLINEAR or weak)
                 and free[i] not in smoothing

@@ -30,6 +30,7 @@ from identification.balance.dataset import Dataset
 from identification.balance.stacked import floor_rows, row_weights, stack
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import Solution
+from identification.fitting.errors_in_variables.products import level_error, noise_products, told
 from identification.fitting.least_squares import least_squares, triangle_of
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import ENOUGH, WeakForm
@@ -55,11 +56,14 @@ class Step:
         By how many variances the training rows fall behind.
     names : tuple of str
         The parameters that do most of it.
+    values : mapping of str to float
+        Of the other records, there.
     """
 
     moved: FloatArray
     price: float
     names: tuple[str, ...]
+    values: Mapping[str, float]
 
 
 @final
@@ -78,12 +82,16 @@ class LeftOpen:
         variance by noise alone, whatever the model leaves of them.
     limits : mapping of str to (low, high)
         Of `names`.
+    told : (unknowns, unknowns) array
+        What a step of the unknowns of `here` is multiplied by, so that the rows fall behind by as
+        much as they tell of it without noise: an acceleration that is all noise tells no inertia.
     """
 
     names: tuple[str, ...]
     asked: frozenset[str]
     here: WeakForm
     limits: Mapping[str, tuple[float, float]]
+    told: FloatArray
 
     @classmethod
     def of(
@@ -107,7 +115,8 @@ class LeftOpen:
         every = (*names_of_runs(model, data.train), *names)
         balances = balances_of(model, sensing, wrt=bare(every))
         limits = bounds_of(model, data.joint.known, data)
-        return cls(names, asked, WeakForm(balances, data, values, every, weights), limits)
+        here = WeakForm(balances, data, values, every, weights)
+        return cls(names, asked, here, limits, _told(here))
 
     def steps(
         self,
@@ -140,7 +149,7 @@ class LeftOpen:
         for b in (b for b in weights if b in self.asked):
             others = [columns[o] * w[:, None] for o, w in weights.items() if o != b]
             own = triangle_of(np.concatenate(others)) if others else np.zeros((0, len(runs)))
-            problem = _Beside(self.here, there, b, own)
+            problem = _Beside(self.here, there, b, own, self.told)
             names = problem.names
             start = problem.start
             found = least_squares(
@@ -158,8 +167,29 @@ class LeftOpen:
                 problem.left(found) - problem.left(start),
                 float(np.sum(problem.lost(found) ** 2)),
                 tuple(n for n, x in zip(self.names, leading, strict=True) if x),
+                there.at(found[: len(every)]),
             )
         return out
+
+
+def _told(here: WeakForm) -> FloatArray:
+    """What the training rows tell of a step of their unknowns, less the noise: of those that enter
+    the rows on a straight line.
+    """
+    out = np.eye(len(here.free))
+    # noise about where a load turns adds no products of a straight line
+    straight = np.flatnonzero(~here.bent & ~here.clocks)
+    if here.balances.has_gap or not len(straight):
+        return out
+    columns = here.jacobian(np.array([here.values[n] for n in here.free]))[:, straight]
+    size = np.linalg.norm(columns, axis=0)
+    seen, straight = size > 0, straight[size > 0]
+    unit = np.outer(size[seen], size[seen])
+    noise = noise_products(here).whole[0][np.ix_(straight, straight)]
+    gram = columns[:, seen].T @ columns[:, seen]
+    kept = told(gram / unit, noise / unit, level_error(here.data))
+    out[np.ix_(straight, straight)] = kept / np.outer(size[seen], 1 / size[seen])
+    return out
 
 
 @final
@@ -176,12 +206,15 @@ class _Beside:
     balance : str
     own : (rows, runs) array
         What the other balances of the other records lose.
+    told : (unknowns, unknowns) array
+        As :class:`LeftOpen` has it.
     """
 
     here: WeakForm
     there: WeakForm
     balance: str
     own: FloatArray
+    told: FloatArray
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -224,7 +257,12 @@ class _Beside:
     def lost(self, x: FloatArray) -> FloatArray:
         """What is lost elsewhere, (rows,)."""
         step = (x - self.start)[: self.own.shape[1]]
-        return np.concatenate([self.own @ step, self.here.residual(x[self._taken]) - self._before])
+        return np.concatenate([self.own @ step, self.here.residual(self._there(x)) - self._before])
+
+    def _there(self, x: FloatArray) -> FloatArray:
+        """Where the training rows are asked, (unknowns of these,)."""
+        start = self.start[self._taken]
+        return np.asarray(start + self.told @ (x[self._taken] - start))
 
     def residual(self, x: FloatArray) -> FloatArray:
         """Weighted rows, and what is lost elsewhere."""
@@ -234,7 +272,7 @@ class _Beside:
         """Their derivative."""
         own = np.zeros((len(self.own), len(self.names)))
         own[:, : self.own.shape[1]] = self.own
-        rows = self.here.jacobian(x[self._taken])
+        rows = self.here.jacobian(self._there(x)) @ self.told
         lost = np.zeros((len(rows), len(self.names)))
         lost[:, self._taken] = rows
         return np.concatenate([self.columns(x), own, lost])

@@ -20,7 +20,11 @@ from identification.fitting.covariance import (
     windows_over,
 )
 from identification.fitting.errors_in_variables.instruments import mixed
-from identification.fitting.errors_in_variables.products import Unbiased, whole_without
+from identification.fitting.errors_in_variables.products import (
+    Unbiased,
+    known,
+    level_error,
+)
 from identification.fitting.turns import Turns
 from identification.fitting.weak_form import WeakForm
 
@@ -118,7 +122,7 @@ class Bands:
         gram = meeting.T @ scaled
         gram = (gram + gram.T) / 2
         added, pulled = noise.whole
-        whole = whole_without(gram, added / unit)
+        whole = known(gram, added / unit, level_error(problem.data))
         windows, tiled = self._windows
         grams, scores = noise.by_window(
             {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()},

@@ -9,9 +9,9 @@ Measurement Error Models, section 2.2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Final, final
 
 import numpy as np
@@ -42,6 +42,8 @@ from identification.fitting.errors_in_variables.products import (
     NoiseProducts,
     Unbiased,
     drawn_rows,
+    known,
+    level_error,
     no_noise,
     noise_products,
     shares,
@@ -52,6 +54,8 @@ from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
+Without = Callable[[FloatArray, FloatArray], FloatArray]
+"""A normal matrix without what noise adds to it, of both."""
 
 MOST_MET: Final = 0.999
 """The same where the columns of other sensors tell what is left: that is known as well as the sums
@@ -96,7 +100,7 @@ def unbiased(
     if problem.balances.has_gap:
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already
-        return Unbiased(dict(problem.values), no_noise(problem))
+        return Unbiased(dict(problem.values), no_noise(problem), None, np.zeros(len(x)))
     start = _Equations.at(problem, problem.turns)
     began = start.rows @ start.rows
     better = _worth_it(start, bounds, moves, share)
@@ -108,8 +112,10 @@ def unbiased(
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
             hidden &= found.rows @ found.rows <= began + MOST_HIDDEN * found.noise_squares
             if hidden and found.as_near_as(start):
-                return Unbiased(dict(found.problem.values), found.noise, found.instruments)
-    return Unbiased(dict(problem.values), no_noise(problem))
+                left = found.left(bounds, moving)
+                return Unbiased(dict(found.problem.values), found.noise, found.instruments, left)
+    left = start.left(bounds, moves)
+    return Unbiased(dict(problem.values), no_noise(problem), None, left)
 
 
 def _worth_it(
@@ -223,36 +229,52 @@ class _Equations:
         here = self
         met = here.instruments.met if here.instruments else frozenset[str]()
         for _ in range(STEPS):
-            problem, step = here.problem, np.zeros(len(here.x))
-            room = (limits[0] - here.x, limits[1] - here.x)
-            if problem.clocks.any():
-                told, free = problem.one_way, moves & ~problem.bent
-                found = here.step(here.rows, room, free, told, float(np.mean(told)))
-                step[problem.clocks] = found[problem.clocks]
-            own, _ = here.columns
-            step += here.step(here.rows + own @ step, room, moves & ~problem.clocks)
-            problem = problem.moved(here.x + np.where(moves, step, 0.0))
+            problem = here.problem.moved(here.x + here.next_step(limits, moves))
             noise = noise_products(problem, met, believed=here.believed)
             here = replace(here, problem=problem, noise=noise, drawn=None)
         return here
+
+    def next_step(
+        self,
+        limits: tuple[FloatArray, FloatArray],
+        moves: npt.NDArray[np.bool_],
+        without: Without = whole_without,
+    ) -> FloatArray:
+        """Step (free,) towards the solution inside the limits; only `moves` move, by what a normal
+        matrix holds `without` the noise.
+        """
+        problem, step = self.problem, np.zeros(len(self.x))
+        room = (limits[0] - self.x, limits[1] - self.x)
+        if problem.clocks.any():
+            told, free = problem.one_way, moves & ~problem.bent
+            share = float(np.mean(told))
+            found = self.step(self.rows, room, free, told=told, share=share, without=without)
+            step[problem.clocks] = found[problem.clocks]
+        own, _ = self.columns
+        step += self.step(self.rows + own @ step, room, moves & ~problem.clocks, without=without)
+        return np.where(moves, step, 0.0)
 
     def step(
         self,
         rows: FloatArray,
         room: tuple[FloatArray, FloatArray],
         moves: npt.NDArray[np.bool_],
+        *,
         told: npt.NDArray[np.bool_] | slice = slice(None),
         share: float = 1.0,
+        without: Without = whole_without,
     ) -> FloatArray:
         """Step of the parameters that move to where the rows that are told, less a share of the
-        noise, hold. What would leave its room stops there, and the others find their place beside
-        it.
+        noise, hold, by what a normal matrix holds `without` it. What would leave its room stops
+        there, and the others find their place beside it.
         """
         (own, by), out = self.columns, np.zeros(len(moves))
         seen = (own[told], None if by is None else by[told])
         moved = np.flatnonzero(moves & (np.linalg.norm(seen[0], axis=0) > 0))
         while len(moved):
-            size, whole, score = self._system(seen, rows[told] + seen[0] @ out, moved, share)
+            size, whole, score = self._system(
+                seen, rows[told] + seen[0] @ out, moved, share=share, without=without
+            )
             found = -np.linalg.pinv(whole, rcond=1e-12, hermitian=True) @ score / size
             beyond = (found < room[0][moved]) | (found > room[1][moved])
             out[moved] = np.where(beyond, np.clip(found, room[0][moved], room[1][moved]), 0.0)
@@ -267,7 +289,9 @@ class _Equations:
         columns: tuple[FloatArray, FloatArray | None],
         rows: FloatArray,
         moved: IntArray,
+        *,
         share: float = 1.0,
+        without: Without = whole_without,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Sizes of the columns that move, their normal matrix without noise and what pushes them,
         in these sizes.
@@ -279,7 +303,7 @@ class _Equations:
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         added, pulled = (share * x for x in noise.whole)
         unit = np.outer(size, size)
-        whole = whole_without((gram + gram.T) / 2 / unit, added / unit)
+        whole = without((gram + gram.T) / 2 / unit, added / unit)
         return size, whole, (meeting.T @ rows - pulled) / size
 
     @staticmethod
@@ -295,7 +319,7 @@ class _Equations:
         fifteen times surer than they say.
         """
         problem = self.problem.moved(self.x + step)
-        without = Unbiased(problem.values, self.noise, self.instruments)
+        without = Unbiased(problem.values, self.noise, self.instruments, np.zeros(len(step)))
         bands = Bands(problem, without, self.turns, share)
         out, moved = np.full(len(moves), np.inf), np.flatnonzero(moves & (bands.norms > 0))
         if not len(moved):
@@ -307,6 +331,13 @@ class _Equations:
             size = np.sqrt(np.maximum(np.diag(inverse), 0.0) / INDEPENDENT_SHARE)
         out[moved] = size / bands.norms[moved]
         return out
+
+    def left(
+        self, limits: tuple[FloatArray, FloatArray], moves: npt.NDArray[np.bool_]
+    ) -> FloatArray:
+        """How far each parameter (free,) may be off by noise that is not taken off."""
+        unsure = level_error(self.problem.data)
+        return np.abs(self.next_step(limits, moves, partial(known, unsure=unsure)))
 
     def unsure(
         self, balance: str, step: FloatArray, moves: npt.NDArray[np.bool_], errors: FloatArray

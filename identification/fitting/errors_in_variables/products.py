@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, final
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
-from identification.balance.stacked import Stacked, noise_believed, stack
+from identification.balance.stacked import INDEPENDENT_SHARE, Stacked, noise_believed, stack
 from identification.balance.weak import WeakRecord
 from identification.fitting.covariance import cores
 from identification.fitting.errors_in_variables.instruments import Instruments, from_others
@@ -24,6 +25,12 @@ MOST_NOISE: Final = 0.9
 """Largest share of the information on a direction that may be noise: the draws know it within 3 %,
 and what is left must stand clear of that.
 """
+KNOWN_NOISE: Final = 0.97
+"""The same where an error is told: one six times as large as that of the rows alone. A step that
+divides by what is left has to be safe.
+"""
+CERTAIN: Final = 1.96
+"""Standard errors of the noise within which a direction may be nothing but noise: 95 %."""
 SURE_STEP: Final = 0.01
 """Least share that counts: a fit has not ended to better than that of its squares."""
 
@@ -109,6 +116,15 @@ def each_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked])
         calm = rows(draws[0].calm, record)
         found.append([(calm, rows(d.noisy, record)) for d in draws])
     return found
+
+
+def level_error(data: Dataset) -> float:
+    """Standard error of the squares that noise adds to a direction, as a share of them: of the
+    noise that is in the training rows, and of the one that is drawn.
+    """
+    drawn = sum(len(d.rows) for record in data.train for d in draws_of(record, data.sources))
+    rows = min(sum(int(w.taking(b).sum()) for w in data.train) for b in data.sensing.balances)
+    return math.sqrt(sum(2 / (INDEPENDENT_SHARE * max(n, 1)) for n in (drawn, rows)))
 
 
 def noise_products(
@@ -208,6 +224,27 @@ def whole_without(whole: FloatArray, noise: FloatArray) -> FloatArray:
     return np.asarray(left * (1 - np.clip(share, 0.0, MOST_NOISE)) @ left.T, dtype=np.float64)
 
 
+def known(whole: FloatArray, noise: FloatArray, unsure: float) -> FloatArray:
+    """What a normal matrix holds at least without noise whose squares are known to `unsure`, a
+    share: what a small rest of much noise tells may be next to nothing. The others are as for
+    :func:`whole_without`.
+    """
+    share, left = shares(whole, noise)
+    share = np.clip(share * (1 + unsure), 0.0, KNOWN_NOISE)
+    return np.asarray(left * (1 - share) @ left.T, dtype=np.float64)
+
+
+def told(whole: FloatArray, noise: FloatArray, unsure: float) -> FloatArray:
+    """What a step is multiplied by, (p, p), so that the rows change by it as much as they tell of
+    it for certain: nothing where it may be noise as well. The arguments are those of
+    :func:`known`.
+    """
+    share, left, right = _apart(whole, noise)
+    share = np.maximum(share, 0.0)
+    kept = np.where(share * (1 + CERTAIN * unsure) < 1, 1 - share, 0.0)
+    return np.asarray(right * np.sqrt(np.maximum(kept, 0.0)) @ left.T, dtype=np.float64)
+
+
 def shares(whole: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Share of noise in directions that are independent in both matrices, and the directions:
     columns whose products add up to `whole`."""
@@ -246,23 +283,31 @@ class Unbiased:
         What noise adds to the normal equations there.
     instruments : Instruments or None
         The columns that meet those of some balances; None where each meets itself.
+    left : (free,) array
+        How far noise that is not taken off may have moved each parameter.
     """
 
     values: Mapping[str, float]
     noise: NoiseProducts
-    instruments: Instruments | None = None
+    instruments: Instruments | None
+    left: FloatArray
 
 
 __all__ = [
+    "KNOWN_NOISE",
+    "MOST_NOISE",
     "DrawnRows",
     "NoiseProducts",
     "Unbiased",
     "certain",
     "drawn_rows",
     "each_drawn",
+    "known",
+    "level_error",
     "moved_rows",
     "no_noise",
     "noise_products",
     "shares",
+    "told",
     "whole_without",
 ]

@@ -10,11 +10,14 @@ import pytest
 from identification import Joint, load_joint, read
 from identification.balance.calibration import settled
 from identification.balance.dataset import load_dataset, prepared_model
+from identification.balance.excitation import excitation_warnings
 from identification.fitting.assess import assess
 from identification.fitting.engine import solve
 from identification.fitting.first_fit import first_fit
 from identification.fitting.left_open import LeftOpen
 from tests.identification.diagnosis.test_session import at_one_speed
+from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
+from tests.identification.fitting.test_errors_in_variables import run
 from tests.recorded_world.world import make_case, write_case
 from tests.smooth_laws import nothing, record
 
@@ -51,6 +54,30 @@ def test_the_right_model_stands_at_its_noise(drawn: np.ndarray) -> None:
     assert plain.max() > 3, "by what is left open it stands far over it"
     assert np.all(np.abs(np.log(beside)) < np.log(1.5))
     assert np.sqrt(np.mean(beside**2)) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4, 10))
+def test_an_inertia_that_only_noise_moves_is_left_open(seed: int) -> None:
+    """Accelerations of slow motion are noise of the encoder, which tells no inertia: neither of the
+    training rows, nor what noise does to the rows of quick motion at the inertia that is there.
+    """
+    train, _ = run(seed, noise=2.0, pace=0.2)
+    held = run(seed, noise=2.0)[0].renamed("held")
+    model = prepared_model(ARM, train)
+    data = load_dataset([train], [held], ARM, model)
+    found = solve(model, data)
+    values = settled(found.model, data.sensing, [*data.train, *data.held_out], found.values)
+    given = LeftOpen.of(found, data, values, frozenset({"link"}))
+    plain, beside = (
+        assess(found.model, data, data.held_out, found.values, x).balances["link"]
+        for x in (None, given)
+    )
+    assert plain.ratio > 4
+    assert beside.ratio < 1.3
+    assert beside.left_open == ("link_inertia",)
+    assert any(
+        "hides the " in said and "link inertia: " in said for said in excitation_warnings(data)
+    )
 
 
 def test_a_step_costs_what_the_training_rows_lose_by_it() -> None:
