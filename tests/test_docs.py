@@ -111,10 +111,13 @@ def shown(page: str) -> bool:
 
 
 def marks_of(page: str) -> list[pytest.MarkDecorator]:
-    """What is left out where; the commands of docs/user-fmu.md stand in test_user_fmu.py, too."""
+    """What is left out where; the commands of the longest pages stand in tests of their own, too:
+    test_user_fmu.py, test_chains.py and test_batch.py.
+    """
     if shown(page):
         return []
-    return [pytest.mark.no_figures, *([pytest.mark.slow] if page == "docs/user-fmu.md" else [])]
+    long = page in ("docs/user-fmu.md", "docs/extending.md", "docs/batch.md")
+    return [pytest.mark.no_figures, *([pytest.mark.slow] if long else [])]
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=marks_of(p)) for p in PAGES])

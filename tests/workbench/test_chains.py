@@ -193,7 +193,7 @@ def test_an_own_effect_is_in_the_report(own: Folder) -> None:
     assert "motor seal torque" in (own.path / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("kind", ["all", "c", "casadi"])
+@pytest.mark.parametrize("kind", [pytest.param("all", marks=pytest.mark.slow), "c", "casadi"])
 def test_an_own_effect_is_exported_in_every_kind(own: Folder, kind: str) -> None:
     """``all`` is plant, plant with controller, estimator, native estimator and system."""
     said = own.run("export", kind, "--joint", "better.toml", "--out", f"dist-{kind}")

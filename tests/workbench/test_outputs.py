@@ -93,6 +93,7 @@ def test_a_report_follows_a_link_and_fills_a_pipe(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.html", "pipe", "target.html"]
 
 
+@pytest.mark.slow
 def test_a_name_that_is_no_utf8_and_an_ascii_terminal_lose_no_result(tmp_path: Path) -> None:
     name = os.fsdecode(b"lauf_" + b"\xfc" + "_\N{ROBOT FACE}.npz".encode())
     (tmp_path / name).write_bytes((DEMO / "train.npz").read_bytes())

@@ -33,7 +33,7 @@ def judged(
     [
         pytest.param("stribeck", {}, marks=pytest.mark.slow),
         pytest.param("cubic_stiffness", {"dirt": True}, marks=pytest.mark.slow),
-        ("load_dependent_friction", {}),
+        pytest.param("load_dependent_friction", {}, marks=pytest.mark.slow),
         pytest.param("hysteresis", {}, marks=pytest.mark.slow),
         pytest.param("torque_sensor_offset", {}, marks=pytest.mark.slow),
         pytest.param("added_spring", {"size": 0.2}, marks=pytest.mark.slow),

@@ -121,6 +121,7 @@ def elastic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
+@pytest.mark.slow
 def test_what_cannot_ride_outside_is_in_the_values_all_the_same(elastic: Path) -> None:
     """A spring at the link: fitted by its outputs without it, the FMU makes up for it with half of
     its gravity more, 200 standard errors from the truth.

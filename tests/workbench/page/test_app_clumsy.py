@@ -299,6 +299,7 @@ def another_program(port: int) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.slow
 def test_what_took_the_place_of_the_server_is_said_and_the_session_comes_back(
     opened: Opened, tmp_path: Path
 ) -> None:

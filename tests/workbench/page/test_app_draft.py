@@ -209,6 +209,7 @@ def test_a_tab_that_has_not_heard_of_it_yet_saves_over_nothing(tabs: Tabs) -> No
     mine.evaluate("listen()")
 
 
+@pytest.mark.slow
 def test_a_draft_stays_where_the_work_of_another_tab_ends(tabs: Tabs) -> None:
     """A fit changes the state, and the view is drawn again; the joint is the one that it was."""
     mine, other = tabs.mine, tabs.other

@@ -95,6 +95,7 @@ def test_records_of_few_samples_are_taken_whole(pair: tuple[Record, Record]) -> 
     assert len(app_analysis._share([many], 60.0)[0]) < 100_000
 
 
+@pytest.mark.slow
 def test_the_whole_loop_and_the_report_take_the_windows_until_confirmed(
     pair: tuple[Record, Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
