@@ -609,7 +609,7 @@ def _with_errors(
         held = [
             k
             for k, n in enumerate(free)
-            if n in at_bound and norms[k] > 0 and not problem.bent[k] and not problem.clocks[k]
+            if n in at_bound and norms[k] > 0 and not problem.clocks[k]
         ]
         high = [values[free[k]] >= limits[free[k]][1] for k in held]
         wider = np.zeros(len(index)) if size is None else bands.beside(index, held, high)

@@ -151,6 +151,31 @@ def test_an_inertia_that_only_noise_moves_is_told_by_no_record() -> None:
         assert error < 0.2 * true["gravity_torque"]
 
 
+@pytest.mark.parametrize("turning", [True, False])
+def test_an_amplitude_whose_shape_stands_at_a_bound_is_as_open_as_the_shape(turning: bool) -> None:
+    """Motion that never turns shows nothing of Stribeck friction: its velocity and its exponent go
+    to their bounds, and its torque was fifty times the truth and eight standard errors off. Where
+    it shows the exponent may stand at the true bound, and the torque is known.
+    """
+    case = simulate_case(
+        "stribeck",
+        73040,
+        overrides={"CURVE": 1.0},
+        records=("train", "train2"),
+        references=None if turning else one_way(73040),
+    )
+    joint = joint_of(case, ("stribeck@motor",))
+    found = fit(joint, [record_of(t, n, "same") for n, t in case.measured.items()]).solution
+    assert "motor_stribeck_exponent" in found.at_bound
+    torque, true = found.values["motor_stribeck_extra"], float(case.parameters["M_TS"])
+    error = found.stderr["motor_stribeck_extra"]
+    assert error is not None
+    assert abs(torque - true) < 3 * error
+    assert ("motor_stribeck_extra" in found.unidentified) is not turning
+    if turning:
+        assert error < 0.01 * true
+
+
 def test_noise_falls_on_the_windows_whose_rows_take_part() -> None:
     products = NoiseProducts({"link": np.eye(2)}, {"link": np.ones(2)})
     windows = csr_array([[1.0, 1.0, 0.4, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 0.5]])
