@@ -977,6 +977,7 @@ class Session:
                         f"needs {EFFECTS[new.effects[0]].title} beside it to explain what "
                         f"{EFFECTS[name].title} does alone"
                     )
+                    self._stands_for(told.claims[position], claim)
                     return told
         return None
 
