@@ -1,5 +1,6 @@
 """What holds for every test."""
 
+import os
 import shutil
 import signal
 import tempfile
@@ -7,8 +8,14 @@ from collections.abc import Iterator
 from multiprocessing.util import Finalize
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 from casadi_models import EFFECTS
+
+# matrices are small: where two workers have a thread for every processor each they wait for each
+# other, and a fit takes five times as long
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+threadpool_limits(1, user_api="blas")
 
 if (
     signal.getsignal(signal.SIGINT) is signal.SIG_IGN
