@@ -112,12 +112,11 @@ def shown(page: str) -> bool:
 
 def marks_of(page: str) -> list[pytest.MarkDecorator]:
     """What is left out where; the commands of the longest pages stand in tests of their own, too:
-    test_user_fmu.py, test_chains.py and test_batch.py.
+    test_user_fmu.py, test_chains.py, test_batch.py and those of the page.
     """
     if shown(page):
         return []
-    long = page in ("docs/user-fmu.md", "docs/extending.md", "docs/batch.md")
-    return [pytest.mark.no_figures, *([pytest.mark.slow] if long else [])]
+    return [pytest.mark.no_figures, pytest.mark.slow]
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=marks_of(p)) for p in PAGES])

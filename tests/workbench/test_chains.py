@@ -302,6 +302,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Folder:
     return folder
 
 
+@pytest.mark.slow
 def test_a_new_effect_is_one_file(library: Folder) -> None:
     """Listed, on both pages, hidden, diagnosed, added, exported and offered in the browser."""
     assert "lip_seal" not in EFFECTS

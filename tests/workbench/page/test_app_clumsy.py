@@ -90,6 +90,7 @@ def test_a_number_that_is_none_is_said_at_its_field_and_changes_nothing(opened: 
     assert "held" in row.inner_text()
 
 
+@pytest.mark.slow
 def test_answers_that_come_late_lose_no_view(opened: Opened) -> None:
     """Every other answer about the state comes after the news that followed it."""
     page = opened.page
