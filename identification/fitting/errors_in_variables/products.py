@@ -26,8 +26,8 @@ MOST_NOISE: Final = 0.9
 and what is left must stand clear of that.
 """
 KNOWN_NOISE: Final = 0.97
-"""The same where an error is told: one six times as large as that of the rows alone. A step that
-divides by what is left has to be safe.
+"""The same where an error is told, which is then thirty times that of rows without noise. A step
+that divides by what is left has to be safer.
 """
 CERTAIN: Final = 1.96
 """Standard errors of the noise within which a direction may be nothing but noise: 95 %."""

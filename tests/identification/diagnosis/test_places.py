@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.signal import welch
 from scipy.stats import t as student_t
 
 from identification.data.joint_file import Joint
 from identification.data.record import Record
+from identification.diagnosis.locate import _averaged_periodogram
 from identification.diagnosis.places import (
     FEWEST_ROWS,
     Axis,
@@ -216,3 +218,13 @@ def test_noise_tells_nothing_and_a_dependence_tells(seed: int) -> None:
     velocity = rows.axes["motor_velocity"].values
     assert not any(place(rows, noise, "motor", axis).tells for axis in rows.axes)
     assert place(rows, noise + 2 * velocity, "motor", "motor_velocity").tells
+
+
+@pytest.mark.parametrize("count", [64, 65, 255, 256, 1000, 3001])
+def test_the_spectrum_of_what_is_left_is_that_of_welch(count: int) -> None:
+    """To one factor, but for the two ends, which a one-sided density counts once."""
+    values = np.random.default_rng(count).standard_normal(count).cumsum()
+    length = min(256, count)
+    _, density = welch(values, nperseg=length - length % 2)
+    ratio = _averaged_periodogram(values, length)[1:-1] / density[1:-1]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)

@@ -9,10 +9,10 @@ import pytest
 
 from identification import Joint, load_joint, read
 from identification.balance.calibration import settled
-from identification.balance.dataset import load_dataset, prepared_model
+from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.excitation import attenuation, excitation_warnings
-from identification.fitting.assess import assess
-from identification.fitting.engine import solve
+from identification.fitting.assess import BalanceError, assess
+from identification.fitting.engine import Solution, solve
 from identification.fitting.first_fit import first_fit
 from identification.fitting.left_open import LeftOpen
 from tests.identification.diagnosis.test_session import at_one_speed
@@ -25,6 +25,17 @@ JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb", "quadratic_drag")
 SEEDS = range(12)
 
 
+def errors(found: Solution, data: Dataset, balance: str) -> tuple[BalanceError, BalanceError]:
+    """Of a balance of the held-out records: without and with what the fit leaves open."""
+    values = settled(found.model, data.sensing, [*data.train, *data.held_out], found.values)
+    given = LeftOpen.of(found, data, values, frozenset({balance}))
+    plain, beside = (
+        assess(found.model, data, data.held_out, found.values, x).balances[balance]
+        for x in (None, given)
+    )
+    return plain, beside
+
+
 def ratios(seed: int) -> tuple[float, float]:
     """Of the right model on a record of many speeds, fitted to one speed: without and with what
     the fit leaves open.
@@ -34,14 +45,8 @@ def ratios(seed: int) -> tuple[float, float]:
     held = record(np.random.default_rng([12, seed]), 10.0, nothing).renamed("held")
     model = prepared_model(JOINT, train)
     data = load_dataset([train], [held], JOINT, model, kernel=0.2)
-    found = solve(model, data)
-    values = settled(model, data.sensing, [*data.train, *data.held_out], found.values)
-    left_open = LeftOpen.of(found, data, values, frozenset({"axis"}))
-    plain, beside = (
-        assess(model, data, data.held_out, found.values, given).balances["axis"].ratio
-        for given in (None, left_open)
-    )
-    return plain, beside
+    plain, beside = errors(solve(model, data), data, "axis")
+    return plain.ratio, beside.ratio
 
 
 @pytest.fixture(scope="module")
@@ -65,13 +70,7 @@ def test_an_inertia_that_only_noise_moves_is_left_open(seed: int) -> None:
     held = run(seed, noise=2.0)[0].renamed("held")
     model = prepared_model(ARM, train)
     data = load_dataset([train], [held], ARM, model)
-    found = solve(model, data)
-    values = settled(found.model, data.sensing, [*data.train, *data.held_out], found.values)
-    given = LeftOpen.of(found, data, values, frozenset({"link"}))
-    plain, beside = (
-        assess(found.model, data, data.held_out, found.values, x).balances["link"]
-        for x in (None, given)
-    )
+    plain, beside = errors(solve(model, data), data, "link")
     assert plain.ratio > 4
     assert beside.ratio < 1.3
     assert beside.left_open == ("link_inertia",)
@@ -115,13 +114,7 @@ def test_a_gap_that_no_training_row_crosses_moves_with_the_zero_of_its_flank(
     train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
     model = prepared_model(joint, train)
     data = load_dataset([train], [held], joint, model)
-    found = first_fit(model, data)
-    values = settled(found.model, data.sensing, [*data.train, *data.held_out], found.values)
-    given = LeftOpen.of(found, data, values, frozenset({"transmission"}))
-    plain, beside = (
-        assess(found.model, data, data.held_out, found.values, x).balances["transmission"]
-        for x in (None, given)
-    )
+    plain, beside = errors(first_fit(model, data), data, "transmission")
     assert plain.ratio > 10
     assert beside.ratio < 1.3
     assert beside.left_open == ("backlash",)
