@@ -42,7 +42,7 @@ from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceE
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
 from identification.fitting.left_open import LeftOpen
-from identification.naming.contest import FEWEST, Rival
+from identification.naming.contest import DECIDED, FEWEST, Contest, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
 FEWEST_ROWS: Final = 40
@@ -131,6 +131,11 @@ class Bench(Protocol):
 
     def same_sign(self, trial: Trial, solution: Solution) -> bool:
         """Whether a small effect has the same sign at half and at double kernel."""
+
+    def other_form(self, step: Step) -> Step | None:
+        """The step with the virtual work of its kinematic error where it has none, or without it;
+        None where the rows do not say that this is nearer.
+        """
 
     def slower(self, factor: float) -> Bench | None:
         """The same records with a longer kernel; None where there is none."""
@@ -453,6 +458,22 @@ class JointBench:
         if contest.ahead[0, 0] > FEWEST:  # what a wrong name leaves is not what is unmodelled
             last = self.ranking(self.base(contest.leader.solution))
         return odds_of(contest, unmodelled(last, claim.balance))
+
+    def other_form(self, step: Step) -> Step | None:
+        """See :class:`Bench`; two forms of a model are held against each other as two names are."""
+        model = step.solution.model
+        if not any(t.place == "torsion" for t in model.terms):
+            return None
+        turned = replace(model, virtual_work=not model.virtual_work)
+        # another form may have its minimum elsewhere, but as near as the one that is left
+        other = self.fitted(turned, step.solution.values, again=True)
+        contest = Contest(
+            [Rival("", form, s) for form, s in (("", step.solution), ("other", other))], self.data
+        )
+        nats, deviate = contest.ahead[0]
+        if nats <= FEWEST or deviate <= DECIDED:
+            return None
+        return self.step(step.added, step.label, other)
 
     def slower(self, factor: float) -> JointBench | None:
         """See :class:`Bench`; made once. A motor alone is seen at a long kernel from the start."""

@@ -385,7 +385,7 @@ class Session:
                 (*standing.steps, after), (*standing.claims, accepted)
             )
             if len(standing.claims) > 1:
-                standing = self._revise(standing)
+                standing = self._in_nearer_form(self._revise(standing))
             # what comes after the last addition of a diagnosis matters only where something is left
             stale = lean and unnamed is None and not self._over(standing.now)
             if not stale:
@@ -1145,6 +1145,22 @@ class Session:
                     claim, effects=names, separate_by=claim.separate_by if len(names) > 1 else None
                 )
         return _Standing(standing.steps, tuple(current))
+
+    def _in_nearer_form(self, standing: _Standing) -> _Standing:
+        """The steps with the virtual work of a kinematic error, or without it, as the rows say
+        beside all that is in the model. Which it is was read where the rest was missing: what is
+        then left of it in the motor's balance are lines at its order that swell and fall with the
+        torque, and those would be named as ripple.
+        """
+        started = standing.steps[0].solution.model
+        if any(t.place == "torsion" for t in started.terms):
+            return standing
+        other = self.bench.other_form(standing.now)
+        if other is None:
+            return standing
+        return self._replay(
+            standing.claims, _Standing((*standing.steps[:-1], other), standing.claims)
+        )
 
     def _replay(
         self,

@@ -398,6 +398,10 @@ class FmuBench:
         """None: what an FMU leaves holds the errors of its solver."""
         return {}
 
+    def other_form(self, step: Step) -> Step | None:
+        """None: how a kinematic error acts on the torques is the FMU's."""
+        return None
+
     def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
         """None: what is left is judged on the outputs."""
         return {}

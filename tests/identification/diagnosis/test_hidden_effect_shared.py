@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from identification import Improvement, improve, load_joint, read
+from identification.diagnosis.session import timed_bench
 from identification.fitting.fit import fit
 
 SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "hidden_effect"
@@ -108,3 +109,25 @@ def test_held_out_error_falls_as_far_as_with_the_true_effect(case: str) -> None:
 def test_what_is_left_reads_as_noise_in_every_balance(case: str) -> None:
     for balance, error in improved(case).final_ratios.items():
         assert 0.8 < error.ratio < 1.5, balance
+
+
+def test_the_form_of_a_kinematic_error_is_that_of_the_rows() -> None:
+    """Its virtual work in or out is told by whole fits, from either side; a model without it has
+    one form.
+    """
+    folder = SHARED / "kinematic_error"
+    joint = load_joint(folder / "joint.toml")
+    records = [read(folder / name, joint=joint) for name in ("train.csv", "test.csv")]
+    bench = timed_bench(joint, records[:1], records[1:])
+    values = improved("kinematic_error").steps[-1].solution.values
+    forms = []
+    for form in (True, False):
+        model = replace(bench.start().model.add("kinematic_error"), virtual_work=form)
+        step = bench.step("kinematic_error", "kinematic_error", bench.fitted(model, values))
+        other = bench.other_form(step)
+        forms.append((other or step).solution.model.virtual_work)
+        assert other is None or other.train.relative_error_percent < 0.5 * (
+            step.train.relative_error_percent
+        )
+    assert forms == [False, False], "the other simulator lets it wind up the spring only"
+    assert bench.other_form(bench.step(None, None, bench.start())) is None

@@ -90,6 +90,8 @@ class World:
         Odds of the names of a claim.
     longer : mapping of float to World
         What rows of so many times the length show.
+    form : bool, optional
+        Whether a kinematic error does virtual work, as the rows have it beside all that is missing.
     """
 
     based: Base
@@ -112,6 +114,7 @@ class World:
     undone: Mapping[frozenset[str], float] = field(default_factory=dict)
     chances: Callable[[Claim, Step], Odds | None] = lambda claim, now: None
     longer: Mapping[float, World] = field(default_factory=dict)
+    form: bool | None = None
     asked: list[tuple[frozenset[str], bool]] = field(default_factory=list)
     fitted_whole: list[str] = field(default_factory=list)
     doubted: list[tuple[int, tuple[Curve, ...], int]] = field(default_factory=list)
@@ -266,6 +269,14 @@ class World:
 
     def left_open(self, step: Step) -> dict[str, Any]:
         return {}
+
+    def other_form(self, step: Step) -> Step | None:
+        model = step.solution.model
+        # which form it is shows beside a second name only
+        if self.form is None or self.form == model.virtual_work or len(step.effects) < 2:
+            return None
+        turned = replace(step.solution, model=replace(model, virtual_work=self.form))
+        return self.step(step.added, step.label, turned)
 
 
 def ended(world: World, most: int = 6) -> Improvement:
@@ -830,6 +841,25 @@ def test_a_better_name_takes_the_place_of_an_earlier_one(swapping: World) -> Non
     assert found.verdict == "complete"
     # each step keeps the form of the law in which it was accepted
     assert [s.solution.model.virtual_work for s in found.steps] == [True, True, False]
+
+
+@pytest.mark.parametrize("form", [True, False])
+def test_the_form_of_a_law_is_asked_again_beside_the_rest(base: Base, form: bool) -> None:
+    laws = {"added_spring": {"p": 1.0}, "quadratic_drag": {"q": 1.0}}
+    world = World(base, {"p": 100.0, "q": 30.0}, laws, turned=frozenset({"added_spring"}))
+    found = ended(replace(world, form=form))
+    assert named(found) == ["added_spring", "quadratic_drag"]
+    # the first name was accepted without virtual work; its step is that of the form that stays
+    assert [s.solution.model.virtual_work for s in found.steps[1:]] == [form, form]
+
+
+def test_the_form_of_a_kinematic_error_of_the_joint_file_stays(base: Base) -> None:
+    model = base.solution.model.add("kinematic_error")
+    based = replace(base, solution=replace(base.solution, model=model))
+    laws = {"added_spring": {"p": 1.0}, "quadratic_drag": {"q": 1.0}}
+    found = ended(World(based, {"p": 100.0, "q": 30.0}, laws, form=not model.virtual_work))
+    assert named(found) == ["added_spring", "quadratic_drag"]
+    assert {s.solution.model.virtual_work for s in found.steps} == {model.virtual_work}
 
 
 def test_a_name_gives_its_place_to_no_set_that_is_no_answer(base: Base) -> None:
