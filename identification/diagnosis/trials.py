@@ -95,7 +95,7 @@ class Noise:
     believed : mapping of str to float
         Share of the noise that the rows show.
     residual : (n,) array, weighted
-        Where the equations of the base hold without the noise.
+        Where the equations of the base hold without the noise, in `order`.
     """
 
     moved: Mapping[str, FloatArray]
@@ -245,7 +245,7 @@ class Base:
         """The same with the residual that a trial starts from."""
         if self.noise is None:
             return self.plain
-        return np.column_stack([self.plain[:, :-1], self.noise.residual[self.order]])
+        return np.column_stack([self.plain[:, :-1], self.noise.residual])
 
     @cached_property
     def products(self) -> FloatArray:
@@ -264,8 +264,8 @@ class Base:
         return np.asarray(squares / np.maximum(squares.sum(axis=0), 1e-300))
 
     def moved(self, drawn: DrawnRows, believed: Mapping[str, float]) -> dict[str, FloatArray]:
-        """What drawn noise changes in rows, with the weights of these."""
-        weights = np.split(self.weight, len(self.balances))
+        """What drawn noise changes in the rows of the products, with the weights of these."""
+        weights = np.split(np.where(self.block >= 0, self.weight, 0.0), len(self.balances))
         return moved_rows(drawn, self.data, dict(zip(self.balances, weights)), believed)
 
     def less_noise(self, grams: FloatArray, noise: FloatArray) -> FloatArray:
@@ -382,7 +382,7 @@ def make_base(solution: Solution, data: Dataset) -> Base:
 
 
 def _noise_of(base: Base, left: FloatArray) -> Noise | None:
-    """What noise adds to the products of a base whose rows the fit has left at `left`, (n,); None
+    """What noise adds to the products of a base all of whose rows the fit has left at `left`; None
     where of no direction it is a share that counts.
     """
     solution, data = base.solution, base.data
@@ -395,7 +395,7 @@ def _noise_of(base: Base, left: FloatArray) -> Noise | None:
     scale = np.append(np.where([n in bent for n in names], 0.0, 1 / norms), 1.0)
     moved = {b: x * scale for b, x in base.moved(drawn, believed).items()}
     p, own = base.parts
-    both = np.column_stack([base.jacobian, base.inward])
+    both, left = base.plain[:, :-1], left[base.order]
     whole = both.T @ both
     noise = np.asarray(sum(x[:, :-1].T @ x[:, :-1] for x in moved.values()))
     if not own or float(shares(whole, noise)[0].max()) < SURE_STEP:
@@ -405,13 +405,13 @@ def _noise_of(base: Base, left: FloatArray) -> Noise | None:
     for x in moved.values():
         x[:, :own] = x[:, :own] @ onto
     kept = {b: x[:, :own].T @ x[:, :p] for b, x in moved.items()}
-    pulled = base.jacobian.T @ left - sum(x[:p] for x in score.values())
+    pulled = both[:, :p].T @ left - sum(x[:p] for x in score.values())
     told = whole[:p, :p] - sum(x[:p] for x in kept.values())
     step = -inverse(told) @ pulled
     for b, x in moved.items():
         x[:, -1] += x[:, :p] @ step
         score[b] += kept[b] @ step
-    return Noise(moved, score, believed, left + base.jacobian @ step)
+    return Noise(moved, score, believed, left + both[:, :p] @ step)
 
 
 def _unseen_sizes(

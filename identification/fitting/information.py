@@ -15,6 +15,7 @@ from identification.balance.dataset import Dataset
 from identification.balance.stacked import INDEPENDENT_SHARE
 from identification.fitting.covariance import RANK
 from identification.fitting.engine import Solution
+from identification.fitting.errors_in_variables.products import known, level_error, noise_products
 from identification.fitting.weak_form import WeakForm
 
 FloatArray = npt.NDArray[np.float64]
@@ -56,10 +57,25 @@ def eliminated(gram: FloatArray, count: int) -> FloatArray:
     return np.asarray(gram[:count, :count] - inside)
 
 
-def information(form: WeakForm, count: int) -> FloatArray:
-    """Normal matrix of the first `count` unknowns of weighted rows at their values."""
+def information(form: WeakForm, count: int, *, measured: bool = False) -> FloatArray:
+    """Normal matrix of the first `count` unknowns of weighted rows at their values.
+
+    Parameters
+    ----------
+    form : WeakForm
+    count : int
+    measured : bool
+        Whether the rows were measured: what noise adds to the products of their columns tells
+        nothing.
+    """
     j = form.jacobian(np.array([form.values[n] for n in form.free]))
-    return eliminated(j.T @ j, count)
+    gram = j.T @ j
+    if measured:
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        unit = np.outer(size, size)
+        noise = noise_products(form).whole[0] / unit
+        gram = unit * known(gram / unit, noise, level_error(form.data))
+    return eliminated(gram, count)
 
 
 def white_errors(gram: FloatArray) -> FloatArray:

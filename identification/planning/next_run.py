@@ -202,10 +202,8 @@ class NextRun:
                     f"  on the records so far the closest two are {p.before:.3g} nats apart"
                 )
                 best = True
-            where = f"{p.run.centre - p.run.half:.3g} to {p.run.centre + p.run.half:.3g}"
             lines.append(
-                f"  {'record' if best else 'or    '} {p.seconds:.0f} s of {p.run.family}, {where} "
-                f"{self.unit}, up to {p.run.speed:.3g} {self.unit}/s, load {p.run.payload}: "
+                f"  {'record' if best else 'or    '} {self._words(p.run, p.seconds)}: "
                 f"{p.nats:.3g} nats expected between the closest two, right with "
                 f"{100 * p.power:.0f} %"
             )
@@ -214,10 +212,8 @@ class NextRun:
             last, best = p.separates, False
         if self.sharpened is not None:
             s = self.sharpened
-            lines.append(
-                f"for parameters that are not identifiable: {s.seconds:.0f} s of {s.run.family}, "
-                f"load {s.run.payload}"
-            )
+            told = self._words(s.run, s.seconds)
+            lines.append(f"for parameters that are not identifiable: {told}")
             lines += [
                 f"    {n}: standard error {_percent(a)} of the value now, {_percent(b)} after"
                 for n, (a, b) in s.errors.items()
@@ -227,6 +223,13 @@ class NextRun:
         if not lines:
             lines.append("no names tie and every parameter is identifiable: no run is needed")
         return "\n".join(lines)
+
+    def _words(self, run: Run, seconds: float) -> str:
+        low, high = run.centre - run.half, run.centre + run.half
+        return (
+            f"{seconds:.0f} s of {run.family}, {low:.3g} to {high:.3g} {self.unit}, up to "
+            f"{run.speed:.3g} {self.unit}/s, load {run.payload}"
+        )
 
     def __repr__(self) -> str:
         return f"NextRun({len(self.proposals)} proposals, {len(self.cannot)} without a motion)"
@@ -448,22 +451,32 @@ def _for_parameters(
         p.name for p in solution.model.parameters if p.name in solution.model.calibration
     }
     free = tuple(n for n in solution.free if n not in solution.at_bound)
-    old = information(form_of(solution, data, free, solution.weights), len(free))
+    form = form_of(solution, data, free, solution.weights)
+    old = information(form, len(free), measured=True)
     spread = dict(zip(free, correlations(old)[0], strict=True))
-    # an amplitude near zero is known to be near zero: only what others stand in for is to plan for
+    # an amplitude near zero is known to be near zero: only what others stand in for is to plan
+    # for, and what a joint has for certain
+    certain = solution.model.named("inertia")
     wanted = [
-        n for n in solution.unidentified if n in free and n not in nuisance and spread[n] > STOOD_IN
+        n
+        for n in solution.unidentified
+        if n in free and n not in nuisance and (spread[n] > STOOD_IN or n in certain)
     ]
     if not wanted:
         return None, []
     now = _relative(old, free, solution.values)
+    for n in wanted:  # windows of time know more than rows of known noise
+        error = solution.stderr.get(n)
+        if error is not None and solution.values[n]:
+            now[n] = max(now[n], error / abs(solution.values[n]))
     best: tuple[float, Run, dict[str, float], float] | None = None
     for run, rows in simulated.rows():
         new = replace(data, train=(rows,), held_out=())
         values = {**solution.values, **dict.fromkeys(names_of_runs(solution.model, [rows]), 0.0)}
         balances = balances_of(solution.model, new.sensing, wrt=())
         weights = row_weights(balances, new, values, solution.sigma, [rows])
-        more = information(form_of(solution, new, free, weights, values), len(free))
+        planned = form_of(solution, new, free, weights, values)
+        more = information(planned, len(free), measured=True)
         for seconds in LENGTHS:
             after = _relative(old + more * seconds / SIMULATED, free, solution.values)
             worst = max(after[n] for n in wanted)

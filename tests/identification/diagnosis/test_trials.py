@@ -42,9 +42,12 @@ from identification.diagnosis.trials import (
     try_candidate,
 )
 from identification.fitting.engine import load_dataset, prepared_model, solve
+from identification.fitting.errors_in_variables.products import MOST_NOISE, shares
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 from identification.naming.contest import rivals_of
+from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
+from tests.identification.fitting.test_errors_in_variables import run as slow_run
 from tests.recorded_world.world import TROUBLES, make_case, write_case
 from tests.smooth_laws import COULOMB, Law, record
 
@@ -808,3 +811,22 @@ def test_a_shape_of_a_law_with_memory_has_the_slope_of_its_rows(elastic: Base) -
         numeric = (problem.residual(x + step) - problem.residual(x)) / size
         assert np.linalg.norm(numeric) > 0
         assert slope[:, k] == pytest.approx(numeric, rel=1e-6, abs=1e-6 * np.abs(numeric).max())
+
+
+@pytest.mark.parametrize("seed", range(4, 10))
+def test_noise_is_taken_off_the_rows_that_it_is_in(seed: int) -> None:
+    """Slow motion of an arm: noise makes nearly all of the column of the inertia, and the rows at
+    the end of a record that fill no block stand in no product.
+    """
+    train, _ = slow_run(seed, noise=2.0, pace=0.2)
+    data = load_dataset([train], [], ARM, prepared_model(ARM, train))
+    base = make_base(solve(prepared_model(ARM, train), data), data)
+    assert base.noise is not None
+    assert np.count_nonzero(base.block < 0) > 0.02 * len(base.block)
+    own = base.parts[1]
+    whole = base.products.sum(axis=(0, 1))[:own, :own]
+    noise = base.noise.products().sum(axis=0)[:own, :own]
+    share, _ = shares(whole, noise)
+    assert 0.8 < share.max() <= MOST_NOISE * (1 + 1e-9)
+    less = base.less_noise(base.products, base.noise.products()).sum(axis=(0, 1))[:own, :own]
+    np.testing.assert_allclose(less, whole - noise, atol=1e-12)

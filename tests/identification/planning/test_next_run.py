@@ -10,13 +10,18 @@ import pytest
 
 from benchmarks.next_run import one_joint
 from casadi_models import JointModel
-from identification import Joint
+from identification import Joint, Record, improve
+from identification.fitting.fit import fit
 from identification.naming.contest import FEWEST
 from identification.planning.blind import blind_spots
 from identification.planning.motion import Motion
+from identification.planning.next_run import KNOWN, next_run
 from identification.planning.rivals import enough, power
 from identification.planning.runs import FAMILIES, LOADS, Plant, Run
+from identification.planning.trajectories import Limits
 from tests.hidden_effect.generator import generate_case
+from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
+from tests.identification.fitting.test_errors_in_variables import run as slow_run
 from workbench.cli.main import main
 
 DT = 2e-3
@@ -94,6 +99,34 @@ def test_the_proposed_run_tells_the_names_apart_as_expected() -> None:
     assert not before[1].one
     assert proposed[1].one
     assert 0.5 < proposed[1].found / proposed[1].expected < 2.0
+
+
+@pytest.mark.parametrize("seed", [4, 5, 7])
+def test_an_inertia_that_noise_hides_is_planned_for_and_then_known(seed: int) -> None:
+    """Slow motion tells nothing of it, however many noisy accelerations its rows hold."""
+    train, true = slow_run(seed, noise=2.0, pace=0.2)
+    held = slow_run(seed, noise=2.0)[0].renamed("held")
+    planned = next_run(improve([train], ARM, [held]), limits=Limits(0.85, 3.0))
+    assert planned.sharpened is not None
+    assert planned.motion is not None
+    now, after = planned.sharpened.errors["link_inertia"]
+    assert now > 1
+    assert after < KNOWN
+    assert "rad/s" in str(planned)
+    q, v, a = planned.motion.position, planned.motion.velocity, planned.motion.acceleration
+    torque = true["link_inertia"] * a + true["link_viscous"] * v
+    torque -= true["gravity_torque"] * np.sin(q)
+    rng = np.random.default_rng(seed)
+    channels = {
+        "link_position": q + 1.2e-3 * rng.standard_normal(len(q)),
+        "link_torque": torque + 0.4 * rng.standard_normal(len(q)),
+    }
+    played = Record.from_channels(planned.motion.time, channels, name="played")
+    solution = fit(ARM, [train, played]).solution
+    error = solution.stderr["link_inertia"]
+    assert error is not None
+    assert 1 / 4 < error / solution.values["link_inertia"] / after < 4
+    assert abs(solution.values["link_inertia"] - true["link_inertia"]) < 3 * error
 
 
 @pytest.mark.slow
