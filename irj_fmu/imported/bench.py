@@ -39,6 +39,7 @@ from identification.diagnosis.trials import (
     flatten,
     make_base,
 )
+from identification.errors import InputError
 from identification.fitting.assess import BalanceError, Error, assess
 from identification.fitting.covariance import correlations, window_errors, windows_over
 from identification.fitting.engine import COLLINEAR as NOT_IDENTIFIED
@@ -242,6 +243,7 @@ class FmuBench:
             return self._fits[model.structure]
         sizes, data, exact = np.zeros(len(self._free)), self.data, True
         solution = solve(model, data, start=start)
+        found = solution, data, sizes
         names = [f.name for f in self._free]
         for number in range(MOST_ROUNDS if self._free else 0):
             sizes, certain = self._moved(solution, data, sizes)
@@ -249,15 +251,40 @@ class FmuBench:
                 break
             # the first step is a large one, which the change of one unit tells well enough
             exact = number > 0
-            data = (
-                self._remade(dict(zip(names, sizes.tolist(), strict=True)))
-                if exact
-                else self._at(sizes)
-            )
-            solution = solve(model, data, start=solution.values)
-        self._known[id(solution)] = solution, data, sizes
+            try:
+                data = (
+                    self._remade(dict(zip(names, sizes.tolist(), strict=True)))
+                    if exact
+                    else self._at(sizes)
+                )
+                solution = solve(model, data, start=solution.values)
+            except InputError:  # along a direction that hardly shows, to where the FMU is no joint
+                break
+            if exact:
+                if not self._nearer(solution, data, found[0], found[1]):
+                    break
+                found = solution, data, sizes
+        solution = found[0]
+        self._known[id(solution)] = found
         self._fits[model.structure] = solution
         return solution
+
+    def _nearer(
+        self, solution: Solution, data: Dataset, best: Solution, best_data: Dataset
+    ) -> bool:
+        """Whether a fit leaves less than the best one of the same model, on the weights of that."""
+
+        def left(one: Solution, given: Dataset) -> float:
+            balances = balances_of(one.model, given.sensing, wrt=())
+            rows = stack(balances, given.train, one.values)
+            return float(
+                sum(
+                    np.mean((r * np.median(best.weights[b]))[rows.taking[b]] ** 2)
+                    for b, r in rows.residual.items()
+                )
+            )
+
+        return left(solution, data) < left(best, best_data)
 
     def stepped(
         self, model: JointModel, start: Mapping[str, float], like: Solution, *, iterations: int

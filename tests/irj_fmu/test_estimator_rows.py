@@ -394,20 +394,31 @@ for one in opened:
 """
 
 
+_OTHER_CODE = """
+
+def _shown_otherwise(self, publish=Estimator._publish):
+    publish(self)
+    self._values[self._theta_at] += 1.0
+
+
+Estimator._publish = _shown_otherwise
+"""
+
+
 @pytest.mark.slow
 def test_two_versions_and_the_project_in_one_process(
     estimator: Path, table: FloatArray, tmp_path: Path
 ) -> None:
-    """The second FMU carries changed code: its packages count time in other samples. Each gives
-    what it gives alone.
+    """The second FMU carries changed code, which shows another value. Each gives what it gives
+    alone.
     """
     changed = tmp_path / "changed"
     for name in ("casadi_models", "identification", "irj_fmu"):
         shutil.copytree(
             _package(name), changed / name, ignore=shutil.ignore_patterns("__pycache__")
         )
-    with (changed / "irj_fmu" / "estimator.py").open("a") as stream:
-        stream.write("\n\nEstimator.default_sample_time = 2e-3\n")
+    with (changed / "irj_fmu" / "estimator" / "slave.py").open("a") as stream:
+        stream.write(_OTHER_CODE)
     files = {
         name: estimator.parent.parent / "texts" / "rows" / name
         for name in ("joint.toml", "estimator.toml")

@@ -26,7 +26,7 @@ from irj_fmu.host.run import Fmu, FmuError, Instance, Wiring, simulate_cs
 from irj_fmu.host.signals import Table
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.correction import PREFIX
-from irj_fmu.imported.diagnose import diagnose
+from irj_fmu.imported.diagnose import diagnose, laid_open
 from irj_fmu.imported.exact import Imported, NotExact, patched_copy
 from irj_fmu.imported.export import export_pair, export_system
 from irj_fmu.imported.file import (
@@ -321,6 +321,21 @@ def test_a_hidden_effect_is_named_added_outside_and_explains_the_rest(
     assert before.ratio > 5
     assert after.ratio < 2
     assert diagnose(larger.model, train, held).claims == ()
+
+
+def test_a_wrong_name_may_lead_nowhere(folder: Path, dragged: Record) -> None:
+    """Losses of the transmission hold the viscous friction that the FMU has itself: along what the
+    two leave a fit ran off to where the FMU does not move, and took the diagnosis with it.
+    """
+    train, held = dragged.window(0, 7), dragged.window(7, 12)
+    model = fit(axis_model(fmu(folder, "Axis", Make(2, CS))), train).model
+    bench = laid_open(model, train, held).bench
+    bare = bench.start()
+    wrong = bench.fitted(bare.model.add("transmission_losses@motor"), bare.values)
+    before, after = (bench.step(None, None, s).train for s in (bare, wrong))
+    assert after.relative_error_percent < before.relative_error_percent
+    change = bench.changes(wrong)["inertia"]
+    assert abs(change) < 0.1 * TRUTH["inertia"]
 
 
 # --- export ---------------------------------------------------------------------------------------

@@ -386,6 +386,12 @@ def test_a_stream_without_a_length_is_cut_at_the_limit(client: Client, root: Pat
     assert list(folder.iterdir()) == []
 
 
+def _port_in(said: str) -> int:
+    match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#home=[\w-]{32}", said.strip())
+    assert match, said
+    return int(match.group(1))
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc").exists(), reason="memory is read from /proc")
 def test_two_gigabytes_are_streamed_and_cut_at_the_limit(tmp_path: Path) -> None:
@@ -402,7 +408,7 @@ def test_two_gigabytes_are_streamed_and_cut_at_the_limit(tmp_path: Path) -> None
     )
     assert process.stdout is not None
     try:
-        client = Client(int(process.stdout.readline().strip().rstrip("/").rsplit(":", 1)[1]))
+        client = Client(_port_in(process.stdout.readline()))
         for _ in range(100):
             try:
                 where = client.session()
@@ -767,10 +773,7 @@ def test_a_killed_server_loses_nothing(tmp_path: Path) -> None:
             [sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True
         )
         assert process.stdout is not None
-        address = process.stdout.readline().strip()
-        match = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/#home=[\w-]{32}", address)
-        assert match, address
-        return process, Client(int(match.group(1)))
+        return process, Client(_port_in(process.stdout.readline()))
 
     def ready(client: Client) -> None:
         for _ in range(100):
