@@ -50,6 +50,11 @@ radians.
 READ: Final[Mapping[str, str]] = {"drive": "the drive's torque", "torque": "the link's torque"}
 """Readings that drift and hum."""
 
+FEWEST_BLOCKS: Final = 6
+"""Blocks of time from which on all but the widest laws of the library, of up to four amplitudes, can
+be told from chance by their scatter (:func:`identification.diagnosis.trials.enough_blocks`).
+"""
+
 REST_WORTH: Final = 0.05
 """Share of rows at rest that is worth a word: joints that stick for a moment at each turn stay
 below.
@@ -96,6 +101,12 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     still = rest_note(data.at_rest())
     if still:
         out.append(still)
+    blocks = blocks_of(data)
+    if blocks < FEWEST_BLOCKS:
+        out.append(
+            f"the training motion fills {blocks} blocks of time, and by their scatter an effect is "
+            f"told from chance: of {FEWEST_BLOCKS} on that holds; record for longer"
+        )
     few = few_reversals(data)
     if few:
         out.append(
@@ -142,6 +153,15 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
             "noise is white, finer encoders avoid it"
         )
     return (*out, *slow_noise_notes(data))
+
+
+def blocks_of(data: Dataset) -> int:
+    """Blocks of time of the training records with rows that take part."""
+    taking = [
+        np.unique(w.block[(w.block >= 0) & np.any([w.taking(b) for b in data.sensing.balances], 0)])
+        for w in data.train
+    ]
+    return sum(len(x) for x in taking)
 
 
 def slow_noise_notes(data: Dataset) -> list[str]:

@@ -11,8 +11,8 @@ from casadi_models import EFFECTS
 from identification.balance.kinematic import residual_unit
 from identification.data.formats import number, words
 from identification.diagnosis.candidates import NotTestable
-from identification.diagnosis.claims import Claim, Ranking
-from identification.diagnosis.trials import Trial
+from identification.diagnosis.claims import COMMON_DROP, GAIN, MAJOR_DROP, Claim, Ranking
+from identification.diagnosis.trials import Trial, enough_blocks
 from identification.errors import InputError
 
 OUTCOMES: Final = ("found", "set", "complete", "unexplained", "not_identifiable")
@@ -71,6 +71,7 @@ def key_of(label: str) -> str:
 
 def weak(trial: Trial) -> str:
     """Why a candidate that the blocks or the held-out records do not support is no claim."""
+    least = COMMON_DROP if trial.effect.common else MAJOR_DROP
     first, then = trial.cv_drop_percent, trial.held_out_drop_percent
     way, other = ("lowers", "raises") if first >= 0 else ("raises", "lowers")
     found = (
@@ -79,6 +80,17 @@ def weak(trial: Trial) -> str:
     if not math.isnan(then):
         same = (then >= 0) == (first >= 0)
         found += f" and {'' if same else f'{other} it '}by {abs(then):.2g} % on held-out records"
+    amplitudes, blocks = len(trial.candidate.amplitudes), len(trial.block_score)
+    if first >= least and not enough_blocks(blocks, amplitudes):
+        return (
+            f"{found}: {blocks} blocks of time do not tell it from chance where "
+            f"{amplitudes + 2} are asked; record for longer"
+        )
+    if first >= least and trial.gain <= GAIN:
+        return (
+            f"{found} (p = {trial.p_value:.2g}): what is left hangs together over so long that "
+            f"this is {trial.gain:.2g} nats, and {GAIN:g} are asked; record for longer"
+        )
     return f"{found} (p = {trial.p_value:.2g}): too little, or not to be told from chance"
 
 

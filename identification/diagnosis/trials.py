@@ -962,6 +962,11 @@ class _Outside:
     scores: FloatArray
 
 
+def enough_blocks(blocks: int, amplitudes: int) -> bool:
+    """Whether the scatter over blocks tells amplitudes from chance: it has a degree of freedom."""
+    return blocks > amplitudes + 1
+
+
 def _beside_base(
     added: FloatArray,
     base: Base,
@@ -976,7 +981,7 @@ def _beside_base(
     p, own = base.parts
     active = np.flatnonzero(delta[own:])
     blocks = int(np.count_nonzero(base.numbers.sum(axis=1)))
-    if not len(active) or blocks <= len(active) + 1:
+    if not len(active) or not enough_blocks(blocks, len(active)):
         return None
     followers = np.concatenate([np.arange(p), p + np.flatnonzero(delta[p:own] > 0)])
     across = total[np.ix_(followers, own + active)]

@@ -127,13 +127,14 @@ const views = {
     const d = state.diagnosis, asks = d && d.not_testable.some((n) => n.asks && n.asks.length), { known } = asks ? await get("/view/joint") : { known: [] };
     const again = button(d ? "Diagnose again" : "Diagnose", () => run("diagnose", {}, "diagnose"), { kind: d ? "" : "primary", id: "diagnose" });
     if (!d) return [h("div", { class: "row between head" }, h("div", {}, heading("What is missing?", "Every effect of the library is tried in every place of the current model, and judged on blocks and records it was not fitted to.")), again)];
-    const clear = d.ranking.filter((r) => r.significant), faint = d.ranking.filter((r) => !r.significant), said = d.claim, fallOf = (r) => (said && said.label === r.label ? said.held_out_drop_percent : r.held_out_drop_percent) || 0, most = Math.max(1, ...d.ranking.map(fallOf)); /* what is claimed was fitted wholly: its figure is the one in the sentence, too */
+    const said = d.claim, named = (r) => Boolean(said) && said.label === r.label; /* a whole fit may name what its trial hardly shows: it stands first, where the sentence above says so */
+    const clear = [...d.ranking.filter(named), ...d.ranking.filter((r) => r.significant && !named(r))], faint = d.ranking.filter((r) => !r.significant && !named(r)), fallOf = (r) => (named(r) ? said.held_out_drop_percent : r.held_out_drop_percent) || 0, most = Math.max(1, ...d.ranking.map(fallOf)); /* what is claimed was fitted wholly: its figure is the one in the sentence, too */
     const curves = d.learned || [], panel = new LawPanel([...clear, ...curves].map((r) => r.label), clear.length ? undefined : LEARNED_NOTE);
     const row = (r, k) => {
       const bar = h("i"), drop = fallOf(r);
       later(() => { bar.style.width = `${Math.max(0, (100 * drop) / most)}%`; });
-      const key = d.claim && d.claim.label === r.label;
-      return h("li", { class: `candidate${r.significant ? "" : " dim"}`, ...pointsAt(panel, r.label) }, h("span", { class: "rank" }, String(k + 1)),
+      const key = named(r);
+      return h("li", { class: `candidate${r.significant || key ? "" : " dim"}`, ...pointsAt(panel, r.label) }, h("span", { class: "rank" }, String(k + 1)),
         h("div", {}, h("h3", {}, r.title, " ", h("span", { class: "place" }, `· ${r.place.replace(/_/g, " ")}`)), h("p", { class: "small" }, `Without it ${r.absence}.`),
           h("p", { class: "small soft" }, `${digits(r.contribution)} ${unit(d.unit)} rms in the ${r.balance} balance; p ${r.p_value < 1e-4 ? "< 0.0001" : "= " + digits(r.p_value, 2)}; evidence ${digits(r.gain_nats)} (gain in log-likelihood).${r.confusable_with.length ? ` Often confused with ${r.confusable_with.map(effectTitle).join(", ")}.` : ""}`)),
         h("div", { class: "effect-size" }, h("p", { class: "small" }, drop > 0 ? ["residual ", h("span", { class: "num" }, `−${digits(drop, 2)} %`)] : "no fall"), h("span", { class: "bar", "aria-hidden": "true" }, bar)),

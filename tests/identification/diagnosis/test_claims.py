@@ -17,6 +17,7 @@ from identification.balance.dataset import HOLD_DELAY, HOLD_NAME
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import (
+    MAJOR_DROP,
     Ranking,
     _discoveries,
     _major,
@@ -101,6 +102,17 @@ def test_an_error_that_rises_is_not_said_to_be_lowered_by_less_than_nothing(base
     assert said(0.2, -0.1) == f"lowers{on}raises it by 0.1 %{tail}"
     assert said(-0.2, 0.1) == f"raises{on}lowers it by 0.1 %{tail}"
     assert said(-0.2, -0.1) == f"raises{on}by 0.1 %{tail}"
+
+
+def test_what_only_a_longer_record_would_tell_says_so(base: Base) -> None:
+    """A fall that is large enough, over blocks that are too few or hang together too long."""
+    values = {"sine": 1.0, "cosine": 1.0}
+    short = trial(base, "gravity", values=values, blocks=np.full(3, 9.0), p=1.0)
+    assert "3 blocks of time do not tell it from chance where 4 are asked" in weak(short)
+    slow = trial(base, "gravity", values=values, gain=2.0)
+    assert "that this is 2 nats, and 3 are asked; record for longer" in weak(slow)
+    little = trial(base, "gravity", values=values, gain=2.0, drop=MAJOR_DROP / 2)
+    assert weak(little).endswith("too little, or not to be told from chance")
 
 
 AXIS = Joint(name="axis", model_name="hd1", effects=("viscous", "coulomb"))

@@ -815,8 +815,8 @@ def test_a_shape_of_a_law_with_memory_has_the_slope_of_its_rows(elastic: Base) -
 
 @pytest.mark.parametrize("seed", range(4, 10))
 def test_noise_is_taken_off_the_rows_that_it_is_in(seed: int) -> None:
-    """Slow motion of an arm: noise makes nearly all of the column of the inertia, and the rows at
-    the end of a record that fill no block stand in no product.
+    """Slow motion of an arm: noise makes nearly all of the column of the inertia, and rows whose
+    kernel touches two blocks stand in no product.
     """
     train, _ = slow_run(seed, noise=2.0, pace=0.2)
     data = load_dataset([train], [], ARM, prepared_model(ARM, train))

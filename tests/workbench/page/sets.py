@@ -324,6 +324,9 @@ def answers(page: Any, address: str, recorded: Recorded, folder: Path) -> Answer
     hand.click("#diagnose")
     hand.idle("diagnose")
     seen = state_of(page, "diagnosis")
+    if seen["claim"]:
+        add = f"add-{re.sub('[@#]', '-', seen['claim']['label'])}"
+        assert page.locator("ol.ranked button").first.get_attribute("id") == add
     if page.locator("button.primary:has-text('Add')").count():
         hand.click("button.primary:has-text('Add')")
         hand.idle("ledger")
