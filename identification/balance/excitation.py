@@ -51,8 +51,8 @@ READ: Final[Mapping[str, str]] = {"drive": "the drive's torque", "torque": "the 
 """Readings that drift and hum."""
 
 FEWEST_BLOCKS: Final = 6
-"""Blocks of time from which on all but the widest laws of the library, of up to four amplitudes, can
-be told from chance by their scatter (:func:`identification.diagnosis.trials.enough_blocks`).
+"""Blocks of time from which on all but the widest laws of the library, of up to four amplitudes,
+can be told from chance by their scatter (:func:`identification.diagnosis.trials.enough_blocks`).
 """
 
 REST_WORTH: Final = 0.05
