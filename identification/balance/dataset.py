@@ -166,6 +166,11 @@ class Dataset:
         return 1 + max(int(w.block.max(initial=-1)) for w in self.train)
 
 
+FEWEST_ROWS: Final = 40
+"""Rows of each balance that the training and the held-out records must have: four to a kernel
+length, ten of them that are independent."""
+
+
 def load_dataset(
     train: Sequence[Record],
     held_out: Sequence[Record],
@@ -220,6 +225,7 @@ def load_dataset(
         if record.payload != train[0].payload:
             made = replace(made, masked=_of_the_link(record, sensing))
         prepared[number] = made
+    fewest = FEWEST_ROWS if told is None else 1  # another kernel has fewer of the same motion
     for balance in sensing.balances:
         if held_out and all(balance in made.masked for made in prepared[count:]):
             raise InputError(
@@ -227,16 +233,16 @@ def load_dataset(
                 f"{train[0].name}, so none shows the {balance} balance; "
                 "give a held-out record with the same payload"
             )
-        at_rest = [
-            not made.taking(balance).any()
-            for made in prepared[count:]
-            if balance not in made.masked
-        ]
-        if at_rest and all(at_rest):
-            raise InputError(
-                f"{held_out[0].name}: the joint stands still in every held-out record; give one "
-                "in which it moves"
-            )
+        for records, kind in ((prepared[:count], "training"), (prepared[count:], "held-out")):
+            moving = [int(w.taking(balance).sum()) for w in records if balance not in w.masked]
+            if moving and sum(moving) < fewest:
+                name = (train if kind == "training" else held_out)[0].name
+                seconds = FEWEST_ROWS / 4 * length
+                raise InputError(
+                    f"{name}: the joint stands still in every {kind} record"
+                    + (", but for a moment" if any(moving) else "")
+                    + f"; give one in which it moves for at least {seconds:.2g} s"
+                )
     noise, colours = (
         _noise_of_all(train, prepared, joint, sensing)
         if told is None

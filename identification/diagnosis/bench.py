@@ -7,14 +7,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Final, Protocol, final
+from typing import Protocol, final
 
 import numpy as np
 
 from casadi_models import JointModel
 from identification.balance.calibration import settled
 from identification.balance.colour import Part
-from identification.balance.dataset import without
+from identification.balance.dataset import FEWEST_ROWS, without
 from identification.balance.sensing import Sensing
 from identification.balance.stacked import drifts_beside
 from identification.data.joint_file import Joint
@@ -45,9 +45,6 @@ from identification.fitting.left_open import LeftOpen
 from identification.naming.contest import DECIDED, FEWEST, Contest, Rival
 from identification.naming.odds import Odds, contenders, contest_of, odds_of, unmodelled
 
-FEWEST_ROWS: Final = 40
-"""Rows of each balance that longer kernels must leave in the training and in the held-out records:
-four to a kernel length, ten of them that are independent."""
 Progress = Callable[[str, float], None]
 Curved = tuple[tuple[LearnedClaim, ...], Step | None]
 

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification import Record, compare, fit, load_joint, read
+from identification import Record, compare, fit, improve, load_joint, read
 from identification.balance.dataset import weak_record
 from identification.balance.excitation import excitation_warnings
 from identification.balance.rest import rest_check, rest_warnings
 from identification.balance.sensing import sense
 from identification.balance.weak import HELD_READINGS, REST_SHARE, prepare
 from identification.data.joint_file import Joint
+from identification.errors import InputError
 from tests.hidden_effect.generator import QUANTUM, generate_case
 
 DT = 0.002
@@ -150,3 +151,30 @@ def test_rest_rows_check_the_model_as_an_inequality(tmp_path: Path) -> None:
     assert not held["added_spring"]["motor"].holds
     assert len(rest_warnings(held["added_spring"], "N.m")) == 1
     assert rest_warnings(held[None], "N.m") == ()
+
+
+@pytest.mark.parametrize("of", ["training", "held-out"])
+def test_a_motion_of_a_moment_is_no_record(of: str) -> None:
+    """A handful of rows carries no fit and no verdict: one line says for how long to move."""
+    rng, t = np.random.default_rng(3), np.arange(0.0, 6.0, DT)
+
+    def arm(name: str, seconds: float) -> Record:
+        angle = np.clip(2 * np.pi * (t - 2.0) / 0.6, 0.0, 2 * np.pi * seconds / 0.6)
+        position = 0.5 * np.sin(angle)
+        noise = rng.standard_normal((2, len(t)))
+        bend = np.gradient(np.gradient(position, t), t)
+        channels = {
+            "link_position": position + 1e-5 * noise[0],
+            "link_torque": 3.0 * bend + 0.1 * noise[1],
+        }
+        return Record.from_channels(t, channels, name=name)
+
+    joint = Joint(model_name="hd1", effects=("viscous@link",))
+    short, long = arm("short", 0.3), arm("long", 3.0)
+    train, held = (short, long) if of == "training" else (long, short)
+    with pytest.raises(InputError) as said:
+        improve([train], joint, [held])
+    assert str(said.value) == (
+        f"short: the joint stands still in every {of} record, but for a moment; give one in which "
+        "it moves for at least 0.6 s"
+    )
