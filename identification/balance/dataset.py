@@ -166,6 +166,11 @@ class Dataset:
         return 1 + max(int(w.block.max(initial=-1)) for w in self.train)
 
 
+def usual_kernel(sensing: Sensing, joint: Joint) -> float:
+    """Length of a row where noise asks for no longer one [s]."""
+    return ONE_SIDED_KERNEL if seen_from_the_motor(sensing, joint) else CLAIM_KERNEL
+
+
 FEWEST_ROWS: Final = 40
 """Rows of each balance that the training and the held-out records must have: four to a kernel
 length, ten of them that are independent."""
@@ -198,8 +203,7 @@ def load_dataset(
         sensing = replace(
             sensing, temperature_origin=like.temperature_origin, longest_run=like.longest_run
         )
-    alone = seen_from_the_motor(sensing, joint)
-    length = kernel or (ONE_SIDED_KERNEL if alone else CLAIM_KERNEL)
+    length = kernel or usual_kernel(sensing, joint)
     prepared: list[WeakRecord] = []
     first, count = 0, len(train)
     again: list[Callable[..., WeakRecord]] = []

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import EFFECTS
+from casadi_models import EFFECTS, JointModel
 from identification.balance.colour import LOWEST_LINE, Part
 from identification.balance.dataset import Dataset
 from identification.balance.weak import REST_SHARE, WeakRecord, differentiated_kernel
@@ -356,6 +356,17 @@ def attenuation(data: Dataset) -> dict[str, float]:
             power = float(np.var(np.concatenate([_moving(w, side) for w in data.train])))
             out[f"{side} inertia"] = noise / max(power, 1e-300)
     return out
+
+
+def noise_of_inertias(data: Dataset, model: JointModel) -> float:
+    """Largest of these shares of an inertia that the model has and the balances show."""
+    shown = attenuation(data)
+    if data.sensing.kinematic or data.sensing.clamped_link:
+        return 0.0
+    names = model.named("inertia")
+    both = {"motor inertia", "link inertia"}
+    sides = {n.replace("_", " ") for n in names} & both or both
+    return max((x for n, x in shown.items() if n in sides), default=0.0)
 
 
 def _moving(record: WeakRecord, side: str) -> FloatArray:

@@ -86,10 +86,12 @@ def weak(trial: Trial) -> str:
             f"{found}: {blocks} blocks of time do not tell it from chance where "
             f"{amplitudes + 2} are asked; record for longer"
         )
+    if first >= least and trial.gain <= GAIN < trial.own_gain:
+        return f"{found} (p = {trial.p_value:.2g}): the other balances lose what this one gains"
     if first >= least and trial.gain <= GAIN:
         return (
             f"{found} (p = {trial.p_value:.2g}): what is left hangs together over so long that "
-            f"this is {trial.gain:.2g} nats, and {GAIN:g} are asked; record for longer"
+            f"this is {max(trial.gain, 0.0):.2g} nats, and {GAIN:g} are asked; record for longer"
         )
     return f"{found} (p = {trial.p_value:.2g}): too little, or not to be told from chance"
 

@@ -1294,8 +1294,9 @@ def timed_bench(
         Unusable records.
     """
     model = prepared_model(joint, train[0])
-    ask = partial(dataset_of, train, held, joint, model, kernel=kernel, like=like)
-    bench = JointBench(joint, ask(), train, held, like=like)
+    data = dataset_of(train, held, joint, model, kernel=kernel, like=like)
+    ask = partial(dataset_of, train, held, joint, model, kernel=data.kernel, like=like)
+    bench = JointBench(joint, data, train, held, like=like)
     if not held:  # nothing is decided without held-out records
         return bench
     try:

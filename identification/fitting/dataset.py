@@ -22,6 +22,7 @@ from identification.balance.clocks import (
     places_of,
 )
 from identification.balance.dataset import Dataset, load_dataset
+from identification.balance.excitation import noise_of_inertias
 from identification.balance.sensing import Sensing
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
@@ -38,6 +39,15 @@ CLOSER: Final = 2
 """Parabolas that lead to the share of a lateness that is a wait: what is left changes by a factor
 ten over a sample, which is no parabola; the second is through points half as far.
 """
+NOISY: Final = 0.5
+"""Share of the squares of an acceleration that may be noise: what is taken off for it then is no
+more than what is left, and noise that is known to a tenth leaves a tenth of the inertia open.
+"""
+LONGER: Final = (2.0, 4.0)
+"""Lengths of longer rows: every factor of two takes noise off by thirty."""
+MOST_KERNEL: Final = 0.25
+"""Longest of them [s]: a sixth of the blocks of time that count as independent, whose edges take
+that much of the rows."""
 BETTER: Final = 0.1
 """Share by which what is left over the noise must fall with another reading of a drive: as much as
 an effect must take off to be named. A fit that lacks an effect leans to whatever stands in for it.
@@ -83,9 +93,13 @@ def dataset_of(
     InputError
         As by :func:`load_dataset`.
     """
-    load = partial(load_dataset, train, held_out, joint, model, kernel=kernel, like=like)
+    whole = partial(load_dataset, train, held_out, joint, model, like=like)
+    read = whole(kernel=kernel) if beside is None else whole(kernel=kernel, late=beside[1])
+    if kernel is None:
+        read = _clear_of_noise(read, model, whole)
+    kernel = read.kernel
+    load = partial(whole, kernel=kernel)
     probe = partial(load_dataset, train, (), joint, model, kernel=kernel, like=like)
-    read = load() if beside is None else load(late=beside[1])
     if not places_of(model):
         return read
 
@@ -103,6 +117,29 @@ def dataset_of(
         return data
     except InputError:  # a fit that is refused is refused where it is asked for
         return read
+
+
+def _clear_of_noise(data: Dataset, model: JointModel, load: Callable[..., Dataset]) -> Dataset:
+    """The records in rows that are long enough for the inertias: as they are where noise is a small
+    part of the averaged accelerations; else the shortest longer ones where it is, or those where it
+    is least.
+
+    Noise of a position, twice differentiated, falls by five powers of the length of a row, and an
+    acceleration of slow motion hardly. Rows are no longer than they must be: longer ones hold less
+    of what is quick.
+    """
+    found, least = data, noise_of_inertias(data, model)
+    for factor in LONGER:
+        if least <= NOISY or data.kernel * factor > MOST_KERNEL:
+            break
+        try:
+            longer = load(kernel=data.kernel * factor)
+        except InputError:  # a record is too short for it, or stands still but for a moment
+            break
+        share = noise_of_inertias(longer, model)
+        if share < least:
+            found, least = longer, share
+    return found
 
 
 def shifts_of(data: Dataset) -> list[dict[str, float]]:

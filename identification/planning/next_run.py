@@ -36,6 +36,7 @@ from identification.planning.runs import (
     possible_loads,
     predicted,
     refuse_clamped,
+    sigma_on,
     workspace_of,
 )
 from identification.planning.trajectories import Limits
@@ -474,7 +475,8 @@ def _for_parameters(
         new = replace(data, train=(rows,), held_out=())
         values = {**solution.values, **dict.fromkeys(names_of_runs(solution.model, [rows]), 0.0)}
         balances = balances_of(solution.model, new.sensing, wrt=())
-        weights = row_weights(balances, new, values, solution.sigma, [rows])
+        sigma = sigma_on(rows, solution, data, values)
+        weights = row_weights(balances, new, values, sigma, [rows])
         planned = form_of(solution, new, free, weights, values)
         more = information(planned, len(free), measured=True)
         for seconds in LENGTHS:

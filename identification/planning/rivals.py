@@ -18,6 +18,7 @@ from identification.balance.weak import WeakRecord
 from identification.fitting.covariance import RANK
 from identification.fitting.information import form_of
 from identification.naming.contest import FEWEST, Contest, Rival, about_turns, turning
+from identification.planning.runs import sigma_on
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,7 +53,8 @@ class Foreseen:
         leader = self._contest.leader.solution
         values = {**leader.values, **dict.fromkeys(names_of_runs(leader.model, [rows]), 0.0)}
         balances = balances_of(leader.model, new.sensing, wrt=())
-        whole = row_weights(balances, new, values, leader.sigma, [rows])
+        sigma = sigma_on(rows, leader, self._contest.data, values)
+        whole = row_weights(balances, new, values, sigma, [rows])
         calm = {b: w * ~turning(leader, [rows], b) for b, w in whole.items()}
         out = np.full((len(self._contest.rivals), len(self._contest.rivals)), math.inf)
         for weights, at_turns in ((whole, True), (calm, False)):

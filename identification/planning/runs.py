@@ -13,12 +13,20 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.term import LINK_INERTIA
-from identification.balance.dataset import LINK_BALANCES, Dataset, run_name, weak_record
+from identification.balance.dataset import (
+    LINK_BALANCES,
+    Dataset,
+    run_name,
+    usual_kernel,
+    weak_record,
+)
 from identification.balance.sensing import Sensing
+from identification.balance.stacked import floors
 from identification.balance.weak import WeakRecord
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
+from identification.fitting.engine import Solution
 from identification.planning.follow import Followed, Follower
 from identification.planning.motion import Motion
 from identification.planning.trajectories import Limits
@@ -364,12 +372,39 @@ def _smoothing(model: JointModel) -> tuple[str, ...]:
 
 
 def predicted(followed: Followed, run: Run, data: Dataset) -> WeakRecord:
-    """The rows that a recording of this run would give, with the noise of the old records."""
+    """The rows that a recording of this run would give, with the noise of the old records: of the
+    usual length where noise made theirs longer, as quicker motion has them.
+    """
     sensing, old = data.sensing, data.train[0]
     record = recorded(followed, data.joint, data.noise, like=sensing)
-    made = weak_record(record, data.joint, sensing, data.kernel, curved=bool(old.curved))
+    length = min(data.kernel, usual_kernel(sensing, data.joint))
+    made = weak_record(record, data.joint, sensing, length, curved=bool(old.curved))
     masked = frozenset(sensing.balances) & LINK_BALANCES if run.load != 1 else frozenset()
     return replace(made, name=run_name(record), masked=masked)
+
+
+def sigma_on(
+    rows: WeakRecord, solution: Solution, data: Dataset, values: Mapping[str, float]
+) -> dict[str, float]:
+    """What a model is expected to leave of each balance on a planned run: what it leaves of the
+    old records over their noise, and the noise of the run's own rows.
+
+    Parameters
+    ----------
+    rows : WeakRecord
+    solution : Solution
+        Of the fit to the old records.
+    data : Dataset
+        The old records.
+    values : mapping of str to float
+        Of the run.
+    """
+    new = replace(data, train=(rows,), held_out=())
+    old, then = floors(solution.model, data, solution.values), floors(solution.model, new, values)
+    return {
+        b: math.sqrt(max(s**2 - old[b] ** 2, 0.0) + max(then[b], 1e-12) ** 2)
+        for b, s in solution.sigma.items()
+    }
 
 
 def recorded(

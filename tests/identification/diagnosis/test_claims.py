@@ -17,7 +17,7 @@ from identification.balance.dataset import HOLD_DELAY, HOLD_NAME
 from identification.data.joint_file import Joint
 from identification.diagnosis.candidates import Candidate, NotTestable, offered
 from identification.diagnosis.claims import (
-    MAJOR_DROP,
+    COMMON_DROP,
     Ranking,
     _discoveries,
     _major,
@@ -110,8 +110,11 @@ def test_what_only_a_longer_record_would_tell_says_so(base: Base) -> None:
     short = trial(base, "gravity", values=values, blocks=np.full(3, 9.0), p=1.0)
     assert "3 blocks of time do not tell it from chance where 4 are asked" in weak(short)
     slow = trial(base, "gravity", values=values, gain=2.0)
+    assert slow.own_gain < 3.0
     assert "that this is 2 nats, and 3 are asked; record for longer" in weak(slow)
-    little = trial(base, "gravity", values=values, gain=2.0, drop=MAJOR_DROP / 2)
+    against = replace(slow, own_gain=9.0)
+    assert weak(against).endswith("the other balances lose what this one gains")
+    little = trial(base, "gravity", values=values, gain=2.0, drop=COMMON_DROP / 2)
     assert weak(little).endswith("too little, or not to be told from chance")
 
 

@@ -101,10 +101,10 @@ def test_the_proposed_run_tells_the_names_apart_as_expected() -> None:
     assert 0.5 < proposed[1].found / proposed[1].expected < 2.0
 
 
-@pytest.mark.parametrize("seed", [4, 5, 7])
+@pytest.mark.parametrize("seed", [5, 7, 9])
 def test_an_inertia_that_noise_hides_is_planned_for_and_then_known(seed: int) -> None:
     """Slow motion tells nothing of it, however many noisy accelerations its rows hold."""
-    train, true = slow_run(seed, noise=2.0, pace=0.2)
+    train, true = slow_run(seed, noise=2.0, pace=0.1)
     held = slow_run(seed, noise=2.0)[0].renamed("held")
     planned = next_run(improve([train], ARM, [held]), limits=Limits(0.85, 3.0))
     assert planned.sharpened is not None
@@ -125,7 +125,7 @@ def test_an_inertia_that_noise_hides_is_planned_for_and_then_known(seed: int) ->
     solution = fit(ARM, [train, played]).solution
     error = solution.stderr["link_inertia"]
     assert error is not None
-    assert 1 / 4 < error / solution.values["link_inertia"] / after < 4
+    assert 1 / 3 < error / solution.values["link_inertia"] / after < 3
     assert abs(solution.values["link_inertia"] - true["link_inertia"]) < 3 * error
 
 
