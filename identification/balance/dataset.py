@@ -161,6 +161,12 @@ class Dataset:
         return left / max(sum(w.rows for w in chosen), 1)
 
     @property
+    def lengthened(self) -> bool:
+        """Whether rows are longer than usual, as noise or who asks for a kernel wants them."""
+        usual = max(usual_kernel(self.sensing, self.joint), KERNEL_SAMPLES * self.train[0].grid.dt)
+        return self.kernel > math.sqrt(2) * usual
+
+    @property
     def blocks(self) -> int:
         """Number of training blocks."""
         return 1 + max(int(w.block.max(initial=-1)) for w in self.train)

@@ -4,7 +4,7 @@ interface.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Protocol, final
@@ -38,7 +38,14 @@ from identification.diagnosis.lines import Line, find_lines, orders_of, other_or
 from identification.diagnosis.locate import Unexplained, locate
 from identification.diagnosis.trials import Base, Trial, make_base, try_candidate
 from identification.errors import InputError
-from identification.fitting.assess import RATIO_LIMIT, VERDICT_KERNELS, BalanceError, Error, assess
+from identification.fitting.assess import (
+    RATIO_LIMIT,
+    VERDICT_KERNELS,
+    BalanceError,
+    Error,
+    assess,
+    verdict_kernel,
+)
 from identification.fitting.engine import Dataset, Solution, load_dataset, prepared_model, solve
 from identification.fitting.first_fit import first_fit
 from identification.fitting.left_open import LeftOpen
@@ -317,12 +324,12 @@ class JointBench:
         if mark not in self._ratios:
             out: dict[str, BalanceError] = {}
             values = self._settled(solution)
-            for length in sorted({VERDICT_KERNELS[b] for b in self.data.sensing.balances}):
+            for length in self._lengths(self.data.sensing.balances):
                 out |= self._errors_at(length, solution.model, values, held_out=held_out)
             drifts, believed = {}, frozenset[str]()
             if any(e.ratio > RATIO_LIMIT for e in out.values()):
                 drifts = drifts_beside(solution.model, self.data, values)
-            for length in sorted({VERDICT_KERNELS[b] for b in out}) if drifts else ():
+            for length in self._lengths(out) if drifts else ():
                 told = self._errors_at(
                     length, solution.model, values, held_out=held_out, drifts=drifts
                 )
@@ -334,7 +341,7 @@ class JointBench:
             over = frozenset(b for b, e in out.items() if e.ratio > RATIO_LIMIT)
             if over and held_out:
                 left_open = LeftOpen.of(solution, self.data, values, over)
-                for length in sorted({VERDICT_KERNELS[b] for b in over}):
+                for length in self._lengths(over):
                     told = self._errors_at(
                         length, solution.model, values, held_out=True, left_open=left_open
                     )
@@ -366,7 +373,14 @@ class JointBench:
         data = self._at_kernel(length).with_drift(drifts)
         records = data.held_out if held_out else data.train
         error = assess(model, data, records, values, left_open)
-        return {b: e for b, e in error.balances.items() if VERDICT_KERNELS[b] == length}
+        return {b: e for b, e in error.balances.items() if self._length(b) == length}
+
+    def _length(self, balance: str) -> float:
+        """Kernel of the verdict of a balance; of slow rows as of those that they were made from."""
+        return VERDICT_KERNELS[balance] if self._slow else verdict_kernel(balance, self.data)
+
+    def _lengths(self, balances: Collection[str]) -> list[float]:
+        return sorted({self._length(b) for b in balances})
 
     def drifts(self, step: Step) -> Mapping[str, Part]:
         """Drift that a fitted model shows and that explains a ratio, by signal."""

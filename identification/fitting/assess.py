@@ -51,6 +51,15 @@ VERDICT_KERNELS: Final = {
 read 1 [s].
 """
 
+
+def verdict_kernel(balance: str, data: Dataset) -> float:
+    """Length of the rows in which a balance of a fit's records is compared with its floor [s]: none
+    shorter than those of the fit where noise asked for longer ones.
+    """
+    usual = VERDICT_KERNELS[balance]
+    return max(usual, data.kernel) if data.lengthened else usual
+
+
 RATIO_LIMIT: Final = 1.5
 """Residual over noise floor above which structure is left; joints without a hidden effect read
 0.9 to 1.4, dirty sensors included.

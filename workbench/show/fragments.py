@@ -16,7 +16,7 @@ from identification.diagnosis.learned import LearnedClaim
 from identification.diagnosis.lines import Line
 from identification.diagnosis.locate import Unexplained
 from identification.diagnosis.places import AXIS_TITLES, Place
-from identification.fitting.assess import VERDICT_KERNELS
+from identification.fitting.assess import verdict_kernel
 from workbench.show.bode import bode_html
 from workbench.show.ceiling import ceiling_html
 from workbench.show.chart import Chart, Curve, FloatArray, Label, Style
@@ -122,7 +122,9 @@ def pattern_html(improvement: Improvement) -> str:
     ]
     kinds = ["flagged" if last[b].ratio > RATIO_LIMIT else "" for b in first]
     head = ["balance", "what it compares", "start model", "after the additions", "state"]
-    clean = ", ".join(f"{text(b)} {number(1e3 * VERDICT_KERNELS[b])} ms" for b in first)
+    clean = ", ".join(
+        f"{text(b)} {number(1e3 * verdict_kernel(b, improvement.data))} ms" for b in first
+    )
     note = (
         f"1 × means: only measurement noise is left. Above {number(RATIO_LIMIT)} × counts as "
         "over the noise. A balance at its noise is averaged over the time at which complete models "

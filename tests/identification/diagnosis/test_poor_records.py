@@ -13,6 +13,8 @@ from identification import Record, fit, improve, load_joint, read
 from identification.balance.excitation import excitation_warnings, few_reversals
 from identification.data.check.quanta import quantum
 from identification.errors import InputError
+from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
+from tests.identification.fitting.test_errors_in_variables import run as arm_run
 
 DEMO = Path(str(files("workbench") / "demo"))
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "hidden_effect" / "stribeck"
@@ -107,3 +109,33 @@ def test_a_run_given_twice_under_two_names_is_refused() -> None:
             improve(given[0], joint, given[1])
     noisy = train.with_channel("motor_current", train["motor_current"] + 1e-9)
     assert len(fit(joint, [train, replace(noisy, name="noisy")], held_out=[held]).data.train) == 2
+
+
+def right_model(seed: int) -> str | None:
+    """What is said of a right model of an arm whose motion is slow and whose encoder is coarse;
+    None where the records are refused.
+    """
+    rng = np.random.default_rng([600, seed])
+    noise, pace, other = np.exp(rng.uniform(np.log([0.1, 0.03, 0.03]), np.log([20.0, 2.0, 2.0])))
+    seconds = float(rng.choice([4.0, 8.0, 15.0, 30.0]))
+    train, _ = arm_run(seed, seconds, noise=float(noise), pace=float(pace))
+    held, _ = arm_run(seed, seconds, noise=float(noise), pace=float(other))
+    effects = (
+        ("viscous@link", "coulomb@link", "gravity") if seed % 2 else ("viscous@link", "gravity")
+    )
+    try:
+        found = improve([train], replace(ARM, effects=effects), [held.renamed("held")])
+    except InputError:
+        return None
+    return "named" if found.claims else found.verdict
+
+
+@pytest.mark.slow
+def test_a_right_model_of_slow_motion_and_coarse_encoders_lacks_nothing() -> None:
+    """Noise hid the inertia, which was fitted too small, and the records stood over the noise of
+    that: one in ten was `unexplained`.
+    """
+    said = [x for x in map(right_model, range(120)) if x is not None]
+    assert len(said) > 40
+    wrong = [x for x in said if x not in ("nothing_missing", "not_identifiable")]
+    assert len(wrong) <= 0.05 * len(said), said
