@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +21,32 @@ if not CASE.exists() and not os.environ.get("CI"):
     pytest.skip("../shared/hidden_effect is not there", allow_module_level=True)
 
 
-@cache
-def result() -> dict[str, Any]:
-    return improve_json(
-        [CASE / "train.csv", CASE / "train2.csv"],
-        [CASE / "test.csv", CASE / "test2.csv"],
-        CASE / "joint.toml",
-    )
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[Path]]:
+    """Training and held-out records: the first half of each."""
+    folder = tmp_path_factory.mktemp("halves")
+    for name in ("train", "train2", "test", "test2"):
+        lines = (CASE / f"{name}.csv").read_text().splitlines(keepends=True)
+        (folder / f"{name}.csv").write_text("".join(lines[: len(lines) // 2]))
+    train, held = ([folder / f"{n}{i}.csv" for i in ("", "2")] for n in ("train", "test"))
+    return train, held
+
+
+@pytest.fixture(scope="module")
+def result(files: tuple[list[Path], list[Path]]) -> dict[str, Any]:
+    return improve_json(*files, CASE / "joint.toml")
 
 
 @pytest.mark.parametrize(
     "schema", [SCHEMA, SHARED / "spec" / "improve.schema.json"], ids=["own", "shared"]
 )
-def test_result_validates(schema: Path) -> None:
+def test_result_validates(result: dict[str, Any], schema: Path) -> None:
     described = json.loads(schema.read_text())
     jsonschema.Draft202012Validator.check_schema(described)
-    jsonschema.validate(json.loads(json.dumps(result())), described)
+    jsonschema.validate(json.loads(json.dumps(result)), described)
 
 
-def test_schema_refuses_what_is_not_a_result() -> None:
+def test_schema_refuses_what_is_not_a_result(result: dict[str, Any]) -> None:
     described = json.loads(SCHEMA.read_text())
     for spoil in (
         {"verdict": "perhaps"},
@@ -49,11 +55,11 @@ def test_schema_refuses_what_is_not_a_result() -> None:
         {"records": {}},
     ):
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate({**json.loads(json.dumps(result())), **spoil}, described)
+            jsonschema.validate({**json.loads(json.dumps(result)), **spoil}, described)
 
 
-def test_parts_of_the_result_agree_with_each_other() -> None:
-    found = result()
+def test_parts_of_the_result_agree_with_each_other(result: dict[str, Any]) -> None:
+    found = result
     assert found["records"]["train"] == ["train", "train2"]
     assert found["records"]["held_out"] == ["test", "test2"]
     assert [s["added"] for s in found["steps"]] == [None, *found["added"]]
@@ -78,11 +84,13 @@ def test_parts_of_the_result_agree_with_each_other() -> None:
 
 
 def test_file_holds_the_same_data_as_the_python_call(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    files: tuple[list[Path], list[Path]],
+    result: dict[str, Any],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     target = tmp_path / "result.json"
-    records = [str(CASE / name) for name in ("train.csv", "train2.csv")]
-    held_out = [str(CASE / name) for name in ("test.csv", "test2.csv")]
+    records, held_out = ([str(path) for path in part] for part in files)
     assert (
         main(
             [
@@ -102,11 +110,11 @@ def test_file_holds_the_same_data_as_the_python_call(
         target.read_text(), parse_constant=lambda text: pytest.fail(f"{text} is not JSON")
     )
     jsonschema.validate(written, json.loads(SCHEMA.read_text()))
-    assert written["added"] == result()["added"]
+    assert written["added"] == result["added"]
     for name, parameter in written["steps"][-1]["parameters"].items():
         assert math.isclose(
             parameter["value"],
-            result()["steps"][-1]["parameters"][name]["value"],
+            result["steps"][-1]["parameters"][name]["value"],
             rel_tol=1e-6,
             abs_tol=1e-12,
         ), name
