@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final, final
 
@@ -60,6 +60,9 @@ def verdict_kernel(balance: str, data: Dataset) -> float:
     return max(usual, data.kernel) if data.lengthened else usual
 
 
+SAME_FLOOR: Final = 0.05
+"""Change of a noise floor by which a step of the parameters is no other one: its length follows the
+floor, and a ratio is told to no more than that."""
 RATIO_LIMIT: Final = 1.5
 """Residual over noise floor above which structure is left; joints without a hidden effect read
 0.9 to 1.4, dirty sensors included.
@@ -227,12 +230,18 @@ def assess(
     if left_open is not None:
         steps = left_open.steps(data, records, values, wide)
         # noise passes a parameter that is open, too: the floor is that of where the step leads
+        other = set()
         for b, step in steps.items():
             there = noise_rows(model, data, step.values, records)
             quick[b], drift[b] = (part[b] for part in there)
             own = together(*there, records)
+            before, after = (rms(x[rows[b]]) for x in (floor[b], own[b]))
+            if abs(after - before) > SAME_FLOOR * before:
+                other.add(b)
             floor[b], wide[b] = own[b], _weights(balances, data, step.values, own, records)[b]
-        steps = left_open.steps(data, records, values, wide)
+        if other:
+            again = replace(left_open, asked=frozenset(other))
+            steps |= again.steps(data, records, values, wide)
     weights = {b: w[rows[b]] for b, w in wide.items()}
     beside = {b: whole[b] + steps[b].moved if b in steps else whole[b] for b in whole}
     turning = partial(turns_of, balances, records, values)

@@ -16,6 +16,7 @@ encoder that its flank stands for. What the other balances of these records lose
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +28,7 @@ import numpy.typing as npt
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, limits_of_runs, names_of_runs
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import floor_rows, row_weights, stack
+from identification.balance.stacked import floor_rows, row_weights, stack, taking_part
 from identification.balance.weak import WeakRecord
 from identification.fitting.engine import Solution
 from identification.fitting.errors_in_variables.products import level_error, noise_products, told
@@ -39,6 +40,13 @@ FloatArray = npt.NDArray[np.float64]
 
 LEADING: Final = 0.5
 """Share of the largest change of the residual from which a parameter is named among those open."""
+FAR: Final = 6.0
+"""Deviations of the noise that a balance stands at, beside unknowns that may be anything, from
+which no step is looked for: it would have to come four times nearer, to what counts as noise, by
+what bends along it alone.
+"""
+MOST_TOLD_BY_NOISE: Final = 0.5
+"""Share of what the rows tell of a step from which on its floor is not that of the fit."""
 ITERATIONS: Final = 15
 """Steps at most: as many as a fit takes in a pass."""
 
@@ -92,6 +100,14 @@ class LeftOpen:
     here: WeakForm
     limits: Mapping[str, tuple[float, float]]
     told: FloatArray
+
+    @property
+    def clear_of_noise(self) -> bool:
+        """Whether the training rows tell most of every step: where noise does, a step may let more
+        of it pass, and the floor is another one there.
+        """
+        kept = np.linalg.eigvals(self.told).real  # roots of what is told without noise
+        return bool(np.all(kept > math.sqrt(1 - MOST_TOLD_BY_NOISE)))
 
     @classmethod
     def of(
@@ -152,6 +168,9 @@ class LeftOpen:
             problem = _Beside(self.here, there, b, own, self.told)
             names = problem.names
             start = problem.start
+            clear = not balances.has_gap and self.clear_of_noise
+            if clear and problem.at_least(start) > FAR**2:
+                continue  # however free they were
             found = least_squares(
                 problem,
                 start,
@@ -246,6 +265,17 @@ class _Beside:
         values = self.there.at(x[: len(self.there.free)])
         bare_ = balances_of(self.there.balances.model, self.there.data.sensing, wrt=())
         return np.asarray(stack(bare_, self.there.data.train, values).residual[self.balance])
+
+    def at_least(self, x: FloatArray) -> float:
+        """Mean square of the weighted residual beside unknowns that cost nothing."""
+        b = self.balance
+        rows = self.left(x) * self.there.weights[b]
+        own = self.columns(x)[:, : len(self.there.free)]
+        size = np.linalg.norm(own, axis=0)
+        unit = own[:, size > 0] / size[size > 0]
+        rest = triangle_of(np.column_stack([unit, rows]))[-1, -1]
+        count = int(np.count_nonzero(taking_part(b, self.there.data.train)))
+        return float(rest**2) / max(count, 1)
 
     def columns(self, x: FloatArray) -> FloatArray:
         """Its weighted derivative, (rows, unknowns)."""

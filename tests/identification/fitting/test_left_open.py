@@ -14,8 +14,8 @@ from identification.balance.excitation import attenuation, excitation_warnings
 from identification.fitting.assess import BalanceError, assess
 from identification.fitting.engine import Solution, solve
 from identification.fitting.first_fit import first_fit
-from identification.fitting.left_open import LeftOpen
-from tests.identification.diagnosis.test_session import at_one_speed
+from identification.fitting.left_open import FAR, LeftOpen
+from tests.identification.diagnosis.test_session import at_one_speed, wave
 from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
 from tests.identification.fitting.test_errors_in_variables import run
 from tests.recorded_world.world import make_case, write_case
@@ -118,3 +118,26 @@ def test_a_gap_that_no_training_row_crosses_moves_with_the_zero_of_its_flank(
     assert plain.ratio > 10
     assert beside.ratio < 1.3
     assert beside.left_open == ("backlash",)
+
+
+def test_no_step_is_looked_for_where_none_can_be_near() -> None:
+    """A law that is missing stands far over the noise whatever the parameters are: what the search
+    would find is no explanation, and costs as much as the fit.
+    """
+    rng = np.random.default_rng([11, 3])
+    train, held = (record(rng, 10.0, wave).renamed(name) for name in ("train", "held"))
+    model = prepared_model(JOINT, train)
+    data = load_dataset([train], [held], JOINT, model, kernel=0.2)
+    found = solve(model, data)
+    values = settled(model, data.sensing, [*data.train, *data.held_out], found.values)
+    given = LeftOpen.of(found, data, values, frozenset({"axis"}))
+    assert given.clear_of_noise
+    plain, beside = errors(found, data, "axis")
+    assert beside.ratio == plain.ratio > FAR
+    assert beside.left_open == ()
+    noisy, _ = run(4, noise=2.0, pace=0.2)
+    arm = prepared_model(ARM, noisy)
+    hidden = load_dataset([noisy], [], ARM, arm)
+    fitted = solve(arm, hidden)
+    settled_there = settled(arm, hidden.sensing, hidden.train, fitted.values)
+    assert not LeftOpen.of(fitted, hidden, settled_there, frozenset()).clear_of_noise
