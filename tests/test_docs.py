@@ -112,8 +112,10 @@ def shown(page: str) -> bool:
 
 def marks_of(page: str) -> list[pytest.MarkDecorator]:
     """What is left out where; the commands of the longest pages stand in tests of their own, too:
-    test_user_fmu.py, test_chains.py, test_batch.py and those of the page.
+    test_user_fmu.py, test_chains.py, test_batch.py, test_explore.py and those of the page.
     """
+    if page == "docs/explore.md":
+        return [pytest.mark.slow]
     if shown(page):
         return []
     return [pytest.mark.no_figures, pytest.mark.slow]

@@ -55,7 +55,7 @@ def test_hidden_effect_is_in_the_set_and_nothing_else_is_claimed(
     [
         pytest.param("cyclic_torque", 7001, marks=pytest.mark.slow),
         pytest.param("stribeck", 7000, marks=pytest.mark.slow),
-        ("kinematic_error", 7001),
+        pytest.param("kinematic_error", 7001, marks=pytest.mark.slow),
         pytest.param("asymmetric_coulomb", 7000, marks=pytest.mark.slow),
         pytest.param("current_offset", 7003, marks=pytest.mark.slow),
     ],
@@ -121,7 +121,8 @@ def test_nothing_is_claimed_where_nothing_is_hidden(tmp_path: Path, seed: int, d
     assert result["claims"] == []
 
 
-@pytest.mark.parametrize("kind", [pytest.param("local_bump", marks=pytest.mark.slow), "odd_order"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["local_bump", "odd_order"])
 def test_what_is_outside_the_library_is_located_and_not_named(tmp_path: Path, kind: str) -> None:
     found, result = judged(tmp_path, kind, 4005)
     assert [c for c in result["claims"] if "curve" not in c] == []  # a curve names no effect
