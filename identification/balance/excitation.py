@@ -132,6 +132,11 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
             "the training records run at one speed nearly all the time (triangle only): add a "
             "multisine record before trusting small claims"
         )
+    if data.lengthened:
+        out.append(
+            f"noise of the positions asks for rows of {data.kernel:.2g} s: what is much quicker "
+            "than that is averaged away; finer encoders or quicker motion give shorter ones"
+        )
     pulled = {
         name: 100 * min(share, 1.0)
         for name, share in attenuation(data).items()

@@ -19,7 +19,7 @@ from identification.balance.calibration import of_run
 from identification.balance.colour import white
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.drawn_noise import LONGEST
-from identification.balance.excitation import attenuation
+from identification.balance.excitation import attenuation, excitation_warnings
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.trials import columns, make_base, noise_beside
 from identification.fitting.covariance import (
@@ -164,6 +164,7 @@ def test_rows_are_as_long_as_noise_asks() -> None:
         found = fit(JOINT, [record])
         assert found.data.kernel == pytest.approx(4 * short.kernel)
         assert attenuation(found.data)["link inertia"] < 0.25
+        assert any("rows of 0.24 s" in w for w in excitation_warnings(found.data))
         for n in NAMES:
             error = found.solution.stderr[n]
             assert error is not None
@@ -175,7 +176,9 @@ def test_rows_are_no_longer_than_noise_asks() -> None:
     record, _ = run(0)
     usual = load_dataset([record], [], JOINT, prepared_model(JOINT, record))
     assert 0.02 < attenuation(usual)["link inertia"] < 0.5
-    assert fit(JOINT, [record]).data.kernel == usual.kernel
+    found = fit(JOINT, [record]).data
+    assert found.kernel == usual.kernel
+    assert not any("asks for rows" in w for w in excitation_warnings(found))
 
 
 @pytest.mark.parametrize("turning", [True, False])
