@@ -104,8 +104,8 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
     blocks = blocks_of(data)
     if blocks < FEWEST_BLOCKS:
         out.append(
-            f"the training motion fills {blocks} blocks of time, and by their scatter an effect is "
-            f"told from chance: of {FEWEST_BLOCKS} on that holds; record for longer"
+            f"the training motion fills {blocks} blocks of time, by whose scatter an effect is "
+            f"told from chance; {FEWEST_BLOCKS} do for nearly all: record for longer"
         )
     few = few_reversals(data)
     if few:

@@ -301,10 +301,13 @@ def outvoted(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Tria
 
 def least_drop(trial: Trial, base: Base) -> float:
     """Fall of the RMS that a claim of this name must bring [%]."""
-    if trial.effect.common:
-        return COMMON_DROP
     unseen = base.solution.model.load_compliance(base.solution.values) > 0
-    return UNSEEN_DROP if unseen else MAJOR_DROP
+    return UNSEEN_DROP if unseen and not trial.effect.common else usual_drop(trial)
+
+
+def usual_drop(trial: Trial) -> float:
+    """The same where the link is recorded [%]."""
+    return COMMON_DROP if trial.effect.common else MAJOR_DROP
 
 
 def least_seen(trial: Trial, base: Base, tried: int) -> float:

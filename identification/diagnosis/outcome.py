@@ -11,7 +11,7 @@ from casadi_models import EFFECTS
 from identification.balance.kinematic import residual_unit
 from identification.data.formats import number, words
 from identification.diagnosis.candidates import NotTestable
-from identification.diagnosis.claims import COMMON_DROP, GAIN, MAJOR_DROP, Claim, Ranking
+from identification.diagnosis.claims import GAIN, Claim, Ranking, usual_drop
 from identification.diagnosis.trials import Trial, enough_blocks
 from identification.errors import InputError
 
@@ -71,7 +71,7 @@ def key_of(label: str) -> str:
 
 def weak(trial: Trial) -> str:
     """Why a candidate that the blocks or the held-out records do not support is no claim."""
-    least = COMMON_DROP if trial.effect.common else MAJOR_DROP
+    least = usual_drop(trial)
     first, then = trial.cv_drop_percent, trial.held_out_drop_percent
     way, other = ("lowers", "raises") if first >= 0 else ("raises", "lowers")
     found = (
