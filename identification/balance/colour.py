@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 REACH: Final = 0.0202
 """Longest spacing of the fourth differences [s], four samples at 200 Hz and one in a hundred more
@@ -54,8 +55,6 @@ STANDS_OUT: Final = 40.0
 """Power of a line over the median around it: noise reaches it once in 1e12 frequencies."""
 AROUND: Final = 40
 """Frequencies, in those that the record resolves, on either side that make this median."""
-WIDTH: Final = 3
-"""Half the width of a line after the window, in the same."""
 PURE: Final = 0.9
 """Share of the power around a line that it must hold itself: that of a vibration of the joint
 wanders with its motion."""
@@ -66,6 +65,15 @@ CLEAN: Final = 0.1
 """Share of a reading that must be no hum: the amplitude of a line is known within 5 %."""
 MOST_LINES: Final = 4
 """Lines of one channel: mains and three harmonics."""
+MOST_TAKEN: Final = 3 * MOST_LINES
+"""Frequencies at most that are taken off one after the other: twice as many of a vibration, which
+is none, as of lines."""
+NEAR_ENOUGH: Final = 0.01
+"""Places of a spectrum to which a frequency is sought: a line is off by a hundredth of a turn at
+the end of a course."""
+LEAKING: Final = 1e-4
+"""Power of a line under which one near it is what it leaves of itself: its windowed course is
+followed to a hundredth."""
 FEWEST_SPACINGS: Final = 4
 """Spacings from which on: one more than white noise beside one with a memory needs."""
 SLOWEST_COLOUR: Final = 1.0
@@ -165,11 +173,21 @@ class ChannelNoise:
         return Part(math.hypot(*(p.size for p in slow)), max(p.memory for p in slow))
 
     @property
+    def hum(self) -> tuple[tuple[float, float], ...]:
+        """The lines that no difference of neighbours shows."""
+        return tuple(line for line in self.lines if line[1] < LOWEST_LINE)
+
+    @property
     def without_drift(self) -> ChannelNoise:
         """The same noise less its drift."""
         if self.drift is None:
             return self
         return replace(self, parts=tuple(p for p in self.parts if p.memory <= SLOWEST_COLOUR))
+
+    @property
+    def without_hum(self) -> ChannelNoise:
+        """The same noise less its hum."""
+        return replace(self, lines=tuple(line for line in self.lines if line[1] >= LOWEST_LINE))
 
     def scaled(self, level: float) -> ChannelNoise:
         """The same colour at another level."""
@@ -357,34 +375,103 @@ def _lines(values: FloatArray, part: slice, dt: float) -> tuple[tuple[float, flo
     return tuple(sorted(found, reverse=True)) if len(found) <= MOST_LINES else ()
 
 
-def lines_in(course: FloatArray, dt: float, lowest: float) -> list[tuple[float, float]]:
+def lines_in(
+    course: FloatArray, dt: float, lowest: float, kept: BoolArray | None = None
+) -> list[tuple[float, float]]:
     """Amplitude and frequency [Hz] of the lines that stand out of a course (n,) at steps of `dt`
     seconds, from a lowest frequency on: pure ones, which hold one frequency from end to end.
+
+    One after the other is taken off, the highest first: two readings of one mains beat a few
+    frequencies apart, and neither is pure while the other stands beside it.
+
+    Parameters
+    ----------
+    course : (n,) array
+    dt, lowest : float
+    kept : (n,) array of bool, optional
+        The samples that count. A line that is looked for in what gaps leave of it is spread over
+        frequencies around it.
     """
     count = len(course)
     if not count:
         return []
+    kept = np.ones(count, dtype=np.bool_) if kept is None else kept
     window = np.sin(np.pi * (np.arange(count) + 0.5) / count) ** 4
-    power = np.abs(np.fft.rfft((course - course.mean()) * window)) ** 2
-    frequency = np.fft.rfftfreq(count, dt)
-    first = max(int(np.searchsorted(frequency, lowest)), AROUND)
-    found: list[tuple[float, float]] = []
-    least = STANDS_OUT * float(np.median(power[first:])) if first < len(power) else 0.0
-    for k in np.flatnonzero(power[first:-AROUND] > least) + first:
-        near = power[k - AROUND : k + AROUND + 1]
-        around = float(np.median(near))
-        own = float(near[AROUND - WIDTH : AROUND + WIDTH + 1].sum()) - (2 * WIDTH + 1) * around
-        usual = around / np.log(2)
-        # noise alone is over its mean by one in e of it
-        over = float(
-            np.sum(np.maximum(near - usual, 0.0)) - (len(near) - 2 * WIDTH - 1) * usual / np.e
-        )
-        if power[k] < near.max() or power[k] < STANDS_OUT * around or own < PURE * over:
+    first = max(int(np.searchsorted(np.fft.rfftfreq(count, dt), lowest)), AROUND)
+
+    def spectrum(values: FloatArray) -> FloatArray:
+        return np.asarray(np.abs(np.fft.rfft(values * window)) ** 2)
+
+    rest = np.where(kept, course - np.mean(course, where=kept), 0.0) if kept.any() else course * 0.0
+    taken: list[tuple[int, float, FloatArray]] = []
+    for _ in range(MOST_TAKEN):
+        power = spectrum(rest)
+        place = _highest(power, first)
+        if place is None:
+            break
+        frequency = _refined(rest * window, place, dt)
+        line = _line_of(rest, kept * window, frequency, dt)
+        taken.append((place, frequency, line))
+        rest = rest - line
+    power, found = spectrum(rest), []
+    sizes = [float(spectrum(line).sum()) for *_, line in taken]
+    for (place, frequency, line), own in zip(taken, sizes, strict=True):
+        near = slice(place - AROUND, place + AROUND + 1)
+        if any(
+            own < LEAKING * other and abs(place - at) <= AROUND
+            for (at, *_), other in zip(taken, sizes, strict=True)
+        ):
             continue
-        # all power of a line in a window: (size/2)^2 n sum of its squares
-        size = 2 * np.sqrt(own / (count * float(np.sum(window**2))))
-        found.append((float(size), float(frequency[k])))
+        usual = float(np.median(power[near])) / math.log(2)
+        # noise alone is over its mean by one in e of it
+        over = float(np.maximum(power[near] - usual, 0.0).sum())
+        over -= (2 * AROUND + 1) * usual / math.e
+        if own >= PURE * (own + max(over, 0.0)):
+            size = math.sqrt(2.0 * float(np.average(line**2, weights=(kept * window) ** 2)))
+            found.append((size, frequency))
     return found
+
+
+def _highest(power: FloatArray, first: int) -> int | None:
+    """The highest frequency of a spectrum that stands out of all and of what is around it."""
+    inner = power[first:-AROUND]
+    if not len(inner):
+        return None
+    least = STANDS_OUT * float(np.median(power[first:]))
+    for k in np.argsort(-inner) + first:
+        if power[k] <= least:
+            break
+        near = power[k - AROUND : k + AROUND + 1]
+        if power[k] >= max(float(near.max()), STANDS_OUT * float(np.median(near))):
+            return int(k)
+    return None
+
+
+def _refined(values: FloatArray, place: int, dt: float) -> float:
+    """Frequency [Hz] at which the spectrum of windowed values is highest near a place of it."""
+    from scipy.optimize import minimize_scalar
+
+    turns = 2j * np.pi * np.arange(len(values)) / len(values)
+    found = minimize_scalar(
+        lambda at: -float(abs(values @ np.exp(-turns * at))),
+        bounds=(place - 1.0, place + 1.0),
+        method="bounded",
+        options={"xatol": NEAR_ENOUGH},
+    )
+    return float(found.x) / (len(values) * dt)
+
+
+def _line_of(values: FloatArray, window: FloatArray, frequency: float, dt: float) -> FloatArray:
+    """The part (n,) of windowed values that holds a frequency to within what the course resolves;
+    zero where the window is.
+    """
+    time = dt * np.arange(len(values))
+    beside = np.array([-1.0, 0.0, 1.0]) / (len(values) * dt)
+    turns = 2.0 * np.pi * np.outer(time, frequency + beside)
+    columns = np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
+    seen = columns * window[:, None]
+    amplitudes = np.linalg.lstsq(seen.T @ seen, seen.T @ (window * values), rcond=None)[0]
+    return np.asarray((columns @ amplitudes) * (window != 0))
 
 
 __all__ = ["MOST_LINES", "ChannelNoise", "Part", "coloured", "lines_in", "spacings_of", "white"]

@@ -29,7 +29,7 @@ from identification.balance.drawn_noise import doubts_of
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
-from identification.balance.slow_noise import SlowNoise, slow_noise_of
+from identification.balance.slow_noise import SlowNoise, power_of, slow_noise_of
 from identification.balance.spikes import without_spikes
 from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
@@ -130,14 +130,21 @@ class Dataset:
             for c, level in self.noise.items()
         }
 
-    def with_drift(self, drifts: Mapping[str, Part]) -> Dataset:
-        """The same records, the readings of some signals drifting by as much at least."""
+    def with_slow_noise(self, slow: Mapping[str, SlowNoise]) -> Dataset:
+        """The same records, the readings of some signals drifting and humming by as much at
+        least.
+        """
         colours, sources = dict(self.colours), self.sources
-        for signal, part in drifts.items():
-            before = sources[signal]
-            if before.drift is None or before.drift.size < part.size:
-                calm = before.without_drift
-                colours[signal] = replace(calm, parts=(*calm.parts, part))
+        for signal, told in slow.items():
+            noise = sources[signal]
+            for part in told.parts:
+                if noise.drift is None or noise.drift.size < part.size:
+                    calm = noise.without_drift
+                    noise = replace(calm, parts=(*calm.parts, part))
+            if power_of(noise.hum) < power_of(told.lines):
+                calm = noise.without_hum
+                noise = replace(calm, lines=(*calm.lines, *told.lines))
+            colours[signal] = noise
         return replace(self, colours=colours)
 
     @property

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS, JointModel
-from identification.balance.colour import LOWEST_LINE, Part
+from identification.balance.colour import LOWEST_LINE
 from identification.balance.dataset import Dataset
+from identification.balance.slow_noise import SlowNoise
 from identification.balance.weak import REST_SHARE, WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
@@ -181,9 +182,13 @@ def slow_noise_notes(data: Dataset) -> list[str]:
     return out
 
 
-def drift_notes(data: Dataset, drifts: Mapping[str, Part]) -> list[str]:
+def readings_notes(data: Dataset, slow: Mapping[str, SlowNoise]) -> list[str]:
     """The same of what a fitted model leaves of the readings."""
-    return [note for c, part in drifts.items() for note in _slow_noise_note(data, c, part.size)]
+    out = []
+    for signal, told in slow.items():
+        drift = max((part.size for part in told.parts), default=0.0)
+        out += _slow_noise_note(data, signal, drift, told.lines)
+    return out
 
 
 def _slow_noise_note(

@@ -11,6 +11,8 @@ its motion. A drift has more power the slower, with the square of the frequency;
 say so, whose other unknowns differ, as motor side and whole joint for a current; one alone only
 where it is surer. A hum holds one frequency from end to end, which the motion does not
 have.
+
+What a fitted model leaves is asked again: there both are seen far better.
 """
 
 from __future__ import annotations
@@ -37,6 +39,9 @@ from identification.balance.memory import cache_of
 from identification.balance.weak import WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+Lines = tuple[tuple[float, float], ...]
+"""Amplitude and frequency [Hz] of each."""
 
 ROUNDS: Final = 4
 """Rounds of reweighting: the rest is known within a hundredth then, its spectrum by far no better.
@@ -86,7 +91,7 @@ class SlowNoise:
     """Slow noise of a reading: its drift; amplitude and frequency [Hz] of the lines of a hum."""
 
     parts: tuple[Part, ...]
-    lines: tuple[tuple[float, float], ...]
+    lines: Lines
 
 
 def slow_noise_of(record: WeakRecord) -> dict[str, SlowNoise]:
@@ -152,10 +157,10 @@ def _walks(record: WeakRecord, rests: Mapping[str, FloatArray]) -> dict[str, flo
     return _agreed({key: walk for key, walk in found.items() if walk is not None})
 
 
-def _lines(
-    record: WeakRecord, rests: Mapping[str, FloatArray]
-) -> dict[str, tuple[tuple[float, float], ...]]:
-    """Lines of each torque's reading: amplitude and frequency [Hz]."""
+def _lines(record: WeakRecord, rests: Mapping[str, FloatArray]) -> dict[str, Lines]:
+    """Lines of each torque's reading: amplitude and frequency [Hz]. Rows of a rest that are zero
+    agree with nothing or take no part: they are left out.
+    """
     rows, length = _longest(record)
     count = int(rows.sum())
     if not count:
@@ -172,9 +177,8 @@ def _lines(
     found = {}
     for key, rest in rests.items():
         found[key] = [
-            # rows that agree with nothing are left out, and hold no part of the line
-            (size / (np.mean(rest != 0) * abs(np.sum(weights * np.exp(2j * np.pi * f * time)))), f)
-            for size, f in lines_in(rest[rows], step, LOWEST_HUM)
+            (size / abs(np.sum(weights * np.exp(2j * np.pi * f * time))), f)
+            for size, f in lines_in(rest[rows], step, LOWEST_HUM, rest[rows] != 0)
             if all(abs(f - other) > SAME / length for other in moving)
         ]
     # beside the other torque a line of either is left
@@ -191,7 +195,7 @@ def _lines(
 def _curves(
     record: WeakRecord,
     side: str,
-    kept: npt.NDArray[np.bool_],
+    kept: BoolArray,
     like: Sequence[WeakRecord] = (),
 ) -> list[FloatArray]:
     """Free curves of what a torque follows from: speed, place, and a friction that changes with the
@@ -205,7 +209,7 @@ def _curves(
     return curves
 
 
-def _warming(record: WeakRecord, side: str, kept: npt.NDArray[np.bool_]) -> list[FloatArray]:
+def _warming(record: WeakRecord, side: str, kept: BoolArray) -> list[FloatArray]:
     """Courses of a friction that changes while a record runs, as where a gear warms: power that
     falls from octave to octave, but it turns with the motion, and no reading does.
     """
@@ -246,12 +250,12 @@ def _agreed(walks: Mapping[str, _Walk]) -> dict[str, float]:
     return found
 
 
-def _longest(record: WeakRecord) -> tuple[npt.NDArray[np.bool_], float]:
+def _longest(record: WeakRecord) -> tuple[BoolArray, float]:
     """Rows of the longest stretch, and its length [s]."""
     return max(_stretches(record), key=lambda s: s[1])
 
 
-def _stretches(record: WeakRecord) -> list[tuple[npt.NDArray[np.bool_], float]]:
+def _stretches(record: WeakRecord) -> list[tuple[BoolArray, float]]:
     """Rows of each stretch, and its length [s]."""
     stretch = record.stretch
     number = np.bincount(stretch) if len(stretch) else np.zeros(1, dtype=np.int64)
@@ -259,7 +263,7 @@ def _stretches(record: WeakRecord) -> list[tuple[npt.NDArray[np.bool_], float]]:
     return [(stretch == k, float(n) * step) for k, n in enumerate(number)]
 
 
-def _telling(record: WeakRecord) -> list[tuple[npt.NDArray[np.bool_], float]]:
+def _telling(record: WeakRecord) -> list[tuple[BoolArray, float]]:
     """Stretches in which a walk is looked for: all that are long enough for it, so that runs of one
     file tell what they tell as files; the longest in any case.
     """
@@ -337,16 +341,17 @@ def _together(walks: Sequence[_Walk | None]) -> _Walk | None:
     )
 
 
-def drift_of_rest(
+def slow_noise_of_rest(
     records: Sequence[WeakRecord], rests: Mapping[str, Sequence[FloatArray]]
-) -> dict[str, Part]:
-    """Drift of the readings of torques in what a fitted model leaves, by signal.
+) -> dict[str, SlowNoise]:
+    """Slow noise of the readings of torques in what a fitted model leaves, by signal.
 
     Beside a model a drift is seen far better than beside all motion; but what the model lacks is
     there, too. A law of the place or the speed is taken off as free curves of these, which all
     records have in common; others have the frequencies of the motion, not power that falls from
     octave to octave: all records together must say so, and the balances agree as in
-    :func:`slow_noise_of`.
+    :func:`slow_noise_of`. A hum is that of the record that has less of it than half of them: its
+    frequency slips from one to the next.
 
     Parameters
     ----------
@@ -357,27 +362,51 @@ def drift_of_rest(
         number where a row takes no part: a walk goes on over what is left out, and what is left
         over is a walk.
     """
-    found = {}
-    for key, courses in rests.items():
-        walks = [
-            _together([_walk(_calm(rest), length) for rest, length in rests])
-            for rests in _beside_laws(records, key, courses)
+    left = {key: _beside_laws(records, key, courses) for key, courses in rests.items()}
+    walks: dict[str, _Walk] = {}
+    for key, courses in left.items():
+        own = [
+            _together(
+                [
+                    _walk(_calm(course[rows & np.isfinite(course)]), length)
+                    for rows, length in _telling(w)
+                ]
+            )
+            for w, course in zip(records, courses, strict=True)
         ]
-        whole = None if None in walks else _together(walks)
-        if whole is None:
-            return {}
-        found[key] = whole
+        whole = None if None in own else _together(own)
+        if whole is not None:
+            walks[key] = whole
+    drifts = _agreed(walks) if walks.keys() == left.keys() else {}
+    hums = [
+        _lines(w, {key: _with_zeros(courses[k]) for key, courses in left.items()})
+        for k, w in enumerate(records)
+    ]
     memory = max(_longest(w)[1] for w in records) / 3.0
-    return {c: _drift(rate, memory) for c, rate in _agreed(found).items()}
+    found = {}
+    for signal in left:
+        hum = sorted((own.get(signal, ()) for own in hums), key=power_of)[(len(hums) - 1) // 2]
+        parts = (_drift(drifts[signal], memory),) if signal in drifts else ()
+        if parts or hum:
+            found[signal] = SlowNoise(parts, hum)
+    return found
+
+
+def _with_zeros(course: FloatArray) -> FloatArray:
+    """A course without rows that agree with nothing, zero where a row takes no part."""
+    kept = np.isfinite(course)
+    out = np.zeros(len(course))
+    out[kept] = _calm(course[kept])
+    return out
 
 
 def _beside_laws(
     records: Sequence[WeakRecord], key: str, courses: Sequence[FloatArray]
-) -> list[list[tuple[FloatArray, float]]]:
-    """What is left of the stretches of each record, with their lengths [s], beside a mean of its
-    own in each and free curves of speed and place that all have in common: a law is the same in
-    every record, a drift is not, and over the few speeds of a sweep a curve of its own would follow
-    it.
+) -> list[FloatArray]:
+    """What is left of each record, (rows,), beside a mean of its own in each of its stretches and
+    free curves of speed and place that all have in common: a law is the same in every record, a
+    drift is not, and over the few speeds of a sweep a curve of its own would follow it. No number
+    outside the stretches, and where a row takes no part.
     """
     stretches = [_telling(w) for w in records]
     kept = [
@@ -387,7 +416,7 @@ def _beside_laws(
     inside = [[rows[k] for rows, _ in own] for own, k in zip(stretches, kept, strict=True)]
     values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
     if not len(values):
-        return [[(values, length) for _, length in own] for own in stretches]
+        return [np.full(len(course), np.nan) for course in courses]
     sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.points for w in records)]
     side = sides[-1] if key == "torque" else sides[0]
     columns = [block_diag(*(np.stack(own, axis=1).astype(np.float64) for own in inside))]
@@ -397,11 +426,12 @@ def _beside_laws(
     if all(warming):
         columns.append(block_diag(*(parts[0] for parts in warming)))
     ends = np.cumsum([np.count_nonzero(k) for k in kept])
-    left = np.split(rest_beside(values, columns, ROUNDS), ends[:-1])
-    return [
-        [(rest[rows], length) for rows, (_, length) in zip(places, own, strict=True)]
-        for rest, places, own in zip(left, inside, stretches, strict=True)
-    ]
+    out = [np.full(len(course), np.nan) for course in courses]
+    for own, k, rest in zip(
+        out, kept, np.split(rest_beside(values, columns, ROUNDS), ends[:-1]), strict=True
+    ):
+        own[k] = rest
+    return out
 
 
 def _drift(rate: float, memory: float) -> Part:
@@ -409,4 +439,9 @@ def _drift(rate: float, memory: float) -> Part:
     return Part(math.sqrt(rate * memory / 2.0), memory)
 
 
-__all__ = ["SlowNoise", "drift_of_rest", "slow_noise_of"]
+def power_of(lines: Lines) -> float:
+    """Mean square of what a few lines make together."""
+    return sum(size**2 for size, _ in lines) / 2.0
+
+
+__all__ = ["SlowNoise", "power_of", "slow_noise_of", "slow_noise_of_rest"]

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
-from identification.balance.colour import ChannelNoise, Part
+from identification.balance.colour import ChannelNoise
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.memory import Law, numbers_of
-from identification.balance.slow_noise import drift_of_rest
+from identification.balance.slow_noise import SlowNoise, slow_noise_of_rest
 from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -354,8 +354,12 @@ def apart_from_drift(
     return np.asarray(np.sqrt(np.maximum(scatter**2 - drift**2, least**2)))
 
 
-def drifts_beside(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, Part]:
-    """See :func:`identification.balance.slow_noise.drift_of_rest`; of all records of the data."""
+def slow_noise_beside(
+    model: JointModel, data: Dataset, values: Mapping[str, float]
+) -> dict[str, SlowNoise]:
+    """See :func:`identification.balance.slow_noise.slow_noise_of_rest`; of all records of the
+    data.
+    """
     balances = balances_of(model, data.sensing, wrt=())
     records = [*data.train, *data.held_out]
     values = settled(model, data.sensing, records, values)
@@ -376,7 +380,7 @@ def drifts_beside(model: JointModel, data: Dataset, values: Mapping[str, float])
         }
     elif whole is not None:
         rests = {"drive": [r[whole] for r in left]}
-    return {c: p for c, p in drift_of_rest(records, rests).items() if c in data.noise}
+    return {c: x for c, x in slow_noise_of_rest(records, rests).items() if c in data.noise}
 
 
 def drift_memory(data: Dataset) -> float:

@@ -13,10 +13,10 @@ import numpy as np
 
 from casadi_models import JointModel
 from identification.balance.calibration import settled
-from identification.balance.colour import Part
 from identification.balance.dataset import FEWEST_ROWS, without
 from identification.balance.sensing import Sensing
-from identification.balance.stacked import drifts_beside
+from identification.balance.slow_noise import SlowNoise
+from identification.balance.stacked import slow_noise_beside
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.candidates import offered
@@ -95,8 +95,8 @@ class Bench(Protocol):
     def ratios(self, step: Step) -> dict[str, BalanceError]:
         """Residual over floor of every balance on held-out records, as the verdict counts it."""
 
-    def drifts(self, step: Step) -> Mapping[str, Part]:
-        """Drift of the torques' readings that the verdict counts in what a step leaves, by
+    def slow_noise(self, step: Step) -> Mapping[str, SlowNoise]:
+        """Drift and hum of the torques' readings that the verdict counts in what a step leaves, by
         signal.
         """
 
@@ -192,7 +192,7 @@ class JointBench:
         self._ratios: dict[tuple[int, bool], tuple[Solution, dict[str, BalanceError]]] = {}
         self._equal: dict[tuple[object, ...], tuple[Solution, dict[str, Equivalence]]] = {}
         self._curves: dict[tuple[object, ...], tuple[Solution, tuple[LearnedClaim, ...]]] = {}
-        self._drifts: dict[tuple[int, bool], Mapping[str, Part]] = {}
+        self._readings: dict[tuple[int, bool], Mapping[str, SlowNoise]] = {}
         self._kernels = {**kernels, round(data.kernel, 9): data}
         self._start: Solution | None = None
         self._started = data.train
@@ -290,9 +290,9 @@ class JointBench:
         """
         verdict = self._judged(solution, held_out=held_out)
         ratios = {b: e.ratio for b, e in verdict.items()}
-        drifts = self._drifts[id(solution), held_out]
-        if drifts:
-            data = self.data.with_drift(drifts)
+        slow = self._readings[id(solution), held_out]
+        if slow:
+            data = self.data.with_slow_noise(slow)
             records = data.held_out if held_out else data.train
             louder = assess(solution.model, data, records, self._settled(solution)).balances
             error = replace(
@@ -326,18 +326,16 @@ class JointBench:
             values = self._settled(solution)
             for length in self._lengths(self.data.sensing.balances):
                 out |= self._errors_at(length, solution.model, values, held_out=held_out)
-            drifts, believed = {}, frozenset[str]()
+            slow, believed = {}, frozenset[str]()
             if any(e.ratio > RATIO_LIMIT for e in out.values()):
-                drifts = drifts_beside(solution.model, self.data, values)
-            for length in self._lengths(out) if drifts else ():
-                told = self._errors_at(
-                    length, solution.model, values, held_out=held_out, drifts=drifts
-                )
-                # what a drift does not explain whole is left as it is
+                slow = slow_noise_beside(solution.model, self.data, values)
+            for length in self._lengths(out) if slow else ():
+                told = self._errors_at(length, solution.model, values, held_out=held_out, slow=slow)
+                # what a slow noise does not explain whole is left as it is
                 whole = {b: e for b, e in told.items() if e.ratio <= RATIO_LIMIT < out[b].ratio}
                 out |= whole
                 believed |= frozenset(whole)
-            self._drifts[mark] = drifts if believed else {}
+            self._readings[mark] = slow if believed else {}
             over = frozenset(b for b, e in out.items() if e.ratio > RATIO_LIMIT)
             if over and held_out:
                 left_open = LeftOpen.of(solution, self.data, values, over)
@@ -345,7 +343,7 @@ class JointBench:
                     told = self._errors_at(
                         length, solution.model, values, held_out=True, left_open=left_open
                     )
-                    # as a drift: what is not explained whole is left as it is
+                    # as a slow noise: what is not explained whole is left as it is
                     out |= {b: e for b, e in told.items() if b in over and e.ratio <= RATIO_LIMIT}
             # the solution is kept with its ratios: an identity is not given to another while it
             # lives
@@ -366,11 +364,11 @@ class JointBench:
         values: Mapping[str, float],
         *,
         held_out: bool,
-        drifts: Mapping[str, Part] = MappingProxyType({}),
+        slow: Mapping[str, SlowNoise] = MappingProxyType({}),
         left_open: LeftOpen | None = None,
     ) -> dict[str, BalanceError]:
         """Errors of the balances whose verdict falls at this kernel."""
-        data = self._at_kernel(length).with_drift(drifts)
+        data = self._at_kernel(length).with_slow_noise(slow)
         records = data.held_out if held_out else data.train
         error = assess(model, data, records, values, left_open)
         return {b: e for b, e in error.balances.items() if self._length(b) == length}
@@ -382,10 +380,10 @@ class JointBench:
     def _lengths(self, balances: Collection[str]) -> list[float]:
         return sorted({self._length(b) for b in balances})
 
-    def drifts(self, step: Step) -> Mapping[str, Part]:
-        """Drift that a fitted model shows and that explains a ratio, by signal."""
+    def slow_noise(self, step: Step) -> Mapping[str, SlowNoise]:
+        """Drift and hum that a fitted model shows and that explain a ratio, by signal."""
         self._judged(step.solution, held_out=True)
-        return self._drifts[id(step.solution), True]
+        return self._readings[id(step.solution), True]
 
     def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
         """Parameters whose errors explain what a balance leaves on held-out records."""

@@ -21,10 +21,10 @@ from identification.balance.clocks import places_of
 from identification.balance.dataset import Dataset, with_effect, without
 from identification.balance.excitation import (
     claim_limit,
-    drift_notes,
     excitation_warnings,
     few_reversals,
     not_identifiable,
+    readings_notes,
     unlike_units,
 )
 from identification.balance.kinematic import without_scale
@@ -547,7 +547,7 @@ class Session:
             warnings=(
                 *hardly_a_model(steps[0]),
                 *excitation_warnings(self.data),
-                *drift_notes(self.data, self.bench.drifts(end)),
+                *readings_notes(self.data, self.bench.slow_noise(end)),
                 *open_notes(self.bench.left_open(end)),
                 *self._about_temperature(judged),
                 *([scale] if (scale := self._scale(solution)) else []),

@@ -520,6 +520,9 @@ def _best_start(
         # which rows lie inside a gap is not known before the gap is
         weights = {b: np.ones(len(row)) for b, row in weights.items()}
         free = [n for n in free if bare([n])[0] not in CLOCKS and n not in smooth]
+    # an exponent that is free from the first step on trades with the velocity beside it, and both
+    # run off: a start keeps it where it is tried
+    free = [n for n in free if n not in exponents]
     bare_ones = balances_of(balances.model, data.sensing, wrt=())
     best: tuple[float, dict[str, float]] | None = None
     for trial in trials:

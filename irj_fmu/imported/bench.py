@@ -16,8 +16,8 @@ from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.term import SIDE_INERTIAS
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled
-from identification.balance.colour import Part
 from identification.balance.sensing import signals_of
+from identification.balance.slow_noise import SlowNoise
 from identification.balance.stamps import evened
 from identification.balance.weak import WeakRecord, differentiated_kernel, filtered
 from identification.data.joint_file import Known
@@ -421,7 +421,7 @@ class FmuBench:
         """Of every balance, at the kernel of the claims."""
         return dict(step.held_out.balances)
 
-    def drifts(self, step: Step) -> Mapping[str, Part]:
+    def slow_noise(self, step: Step) -> Mapping[str, SlowNoise]:
         """None: what an FMU leaves holds the errors of its solver."""
         return {}
 

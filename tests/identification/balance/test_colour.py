@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.signal import lfilter
 
 from identification import Joint, Record, fit
 from identification.balance.colour import (
@@ -14,6 +15,7 @@ from identification.balance.colour import (
     Part,
     _two_shares,
     coloured,
+    lines_in,
     spacings_of,
     white,
 )
@@ -146,6 +148,22 @@ def test_hum_is_told_from_noise_and_a_motion_has_none() -> None:
     knocks[rng.integers(0, COUNT, 60)] = rng.standard_normal(60)
     ring = np.exp(-0.02 * 2 * np.pi * 40 * TIME[:2000]) * np.sin(2 * np.pi * 40 * TIME[:2000])
     assert read(torque + 3.0 * np.convolve(knocks, ring)[:COUNT]).lines == ()
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_lines_that_beat_are_two_and_a_hump_is_none(stops: bool) -> None:
+    """Each made the other impure; what is left out of a stop spreads a line."""
+    rng, dt = np.random.default_rng(6), 0.016
+    time = dt * np.arange(2500)
+    kept = (time % 3.1 > 1.0) if stops else np.ones(len(time), dtype=bool)
+    noise = 0.02 * rng.standard_normal(len(time))
+    beating = 0.05 * np.sin(2 * np.pi * 11.57 * time) + 0.03 * np.sin(2 * np.pi * 10.97 * time)
+    found = lines_in(np.where(kept, noise + beating, 0.0), dt, 5.0, kept)
+    assert sorted(f for _, f in found) == pytest.approx([10.97, 11.57], abs=0.002)
+    assert sorted(size for size, _ in found) == pytest.approx([0.03, 0.05], rel=0.1)
+    pole = 0.99 * np.exp(2j * np.pi * 11.0 * dt)
+    hump = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], rng.standard_normal(len(time)))
+    assert lines_in(np.where(kept, noise + 0.1 * hump, 0.0), dt, 5.0, kept) == []
 
 
 def test_wild_samples_are_bridged_and_nothing_else_is_touched() -> None:

@@ -21,6 +21,7 @@ from identification.data.joint_file import Known
 from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
 from identification.fitting.information import white_errors
 from identification.fitting.trust import Trusted, trust
+from tests.hidden_effect import generator
 from tests.hidden_effect.generator import Case, generate_case, simulate_case
 from workbench.cli.main import main
 
@@ -46,6 +47,22 @@ def fitted(
 def judged() -> dict[str, Trusted]:
     solution, data = fitted(joint_of(case(), ("stribeck@motor",)))
     return {p.name: p for p in trust(solution, data).parameters}
+
+
+def test_an_exponent_does_not_run_off_from_a_fine_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A smoothing velocity of 25 times the truth and a Stribeck torque of 14 times it fit each
+    other; every start ended there, its exponent free from the first step on.
+    """
+    steps = {name: 0.05 * step for name, step in generator.QUANTUM.items()}
+    monkeypatch.setattr(generator, "QUANTUM", steps)
+    sharp = {"CURVE": 1.0, "M_V0": 0.0, "L_V0": 0.0}
+    found = simulate_case("stribeck", 73005, records=("train", "train2"), overrides=sharp)
+    joint = joint_of(found, ("stribeck@motor",))
+    records = [record_of(table, name, "same") for name, table in found.measured.items()]
+    model = prepared_model(joint, records[0])
+    values = solve(model, load_dataset(records, [], joint, model)).values
+    assert values["motor_stribeck_extra"] == pytest.approx(found.parameters["M_TS"], rel=0.02)
+    assert values["motor_stribeck_velocity"] == pytest.approx(found.parameters["M_VS"], rel=0.02)
 
 
 def test_most_intervals_hold_the_truth_and_none_is_far_off() -> None:
