@@ -271,21 +271,42 @@ class Balances:
         `remembered` is a record with the same smoothed positions, whose internal states may be
         known already.
         """
-        p = [float(values[n]) for n in self.names]
+        p = tuple(float(values[n]) for n in self.names)
 
         def rows() -> FloatArray:
-            memory = self.memory_values(remembered or data, values)
-            full = self._plain.rows(data.means(_NAMES), data.average, data, memory, p)
-            if self._curved is not None:
-                full += self._curved.rows(data.bends(_NAMES), data.curve, data, memory, p)
-            return full
+            return self._rows(data, self.memory_values(remembered or data, values), p)
 
-        full = rows() if self.wrt else residuals_of(data, (self.law, tuple(p)), rows)
+        full = rows() if self.wrt else residuals_of(data, (self.law, p), rows)
         width = 1 + len(self.wrt)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])
             for i, b in enumerate(self.balances)
         }
+
+    def _rows(self, data: WeakRecord, memory: FloatArray, p: tuple[float, ...]) -> FloatArray:
+        """Rows with the internal states given at the points, (rows, expressions and columns)."""
+        full = self._plain.rows(data.means(_NAMES), data.average, data, memory, p)
+        if self._curved is not None:
+            full += self._curved.rows(data.bends(_NAMES), data.curve, data, memory, p)
+        return full
+
+    def begun(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, FloatArray]:
+        """How much each row of every balance, (rows,), hangs on the state in which its segment
+        began, which nothing tells: that of rest against the largest of the record.
+        """
+        memory = self._memory
+        if memory is None:
+            return {b: np.zeros(data.rows) for b in self.balances}
+        p = tuple(float(values[n]) for n in self.names)
+
+        def rows() -> FloatArray:
+            rest = self.memory_values(data, values)
+            most = np.abs(rest).max(axis=1, initial=0.0)
+            moved = memory.along(data, np.array(p), most)
+            return self._rows(data, moved, p) - self._rows(data, rest, p)
+
+        full = np.abs(residuals_of(data, ("begun", self.law, self.wrt, p), rows))
+        return {b: full[:, i * (1 + len(self.wrt))] for i, b in enumerate(self.balances)}
 
     @property
     def has_gap(self) -> bool:
@@ -411,8 +432,10 @@ class Memory:
             "stretch", [z0, many, aside, p, clock], [ca.densify(ca.horzcat(*trail))]
         )
 
-    def along(self, data: WeakRecord, p: FloatArray) -> FloatArray:
-        """States (states, points) at the points of a record; every segment begins at rest."""
+    def along(self, data: WeakRecord, p: FloatArray, begin: FloatArray | None = None) -> FloatArray:
+        """States (states, points) at the points of a record; every segment begins at rest, or in
+        the states (states,) `begin`.
+        """
         count = len(data.points["motor_position"])
         matrix = np.zeros((len(_NAMES), count))
         for i, name in enumerate(_NAMES):
@@ -425,7 +448,7 @@ class Memory:
                 both[_NAMES.index(name)] = values
             where = where.copy()
             where[self._of_torsion] = self.coordinates(count, both, p)[self._of_torsion]
-        out = self._followed(data, where, matrix, p)
+        out = self._followed(data, where, matrix, p, begin)
         if not data.doubts or not len(self._of_torsion):
             return out
 
@@ -434,33 +457,49 @@ class Memory:
             for name, values in track.items():
                 both[_NAMES.index(name)] = values
             there[self._of_torsion] = self.coordinates(count, both, p)[self._of_torsion]
-            return self._followed(data, there, matrix, p)
+            return self._followed(data, there, matrix, p, begin)
 
         calm, *shaken = data.doubts
         return out + along(calm) - sum(along(track) for track in shaken) / len(shaken)
 
     def _followed(
-        self, data: WeakRecord, where: FloatArray, matrix: FloatArray, p: FloatArray
+        self,
+        data: WeakRecord,
+        where: FloatArray,
+        matrix: FloatArray,
+        p: FloatArray,
+        begin: FloatArray | None,
     ) -> FloatArray:
         """States along coordinates (coordinates, points), every segment by itself."""
         out = np.zeros((self._states, where.shape[1]))
         for first, last in zip(data.starts[:-1], data.starts[1:], strict=True):
             out[:, first:last] = self.follow(
-                where[:, first:last], matrix[:, first:last], p, data.grid.dt * data.grid.step
+                where[:, first:last],
+                matrix[:, first:last],
+                p,
+                data.grid.dt * data.grid.step,
+                begin,
             )
         return out
 
     def follow(
-        self, where: FloatArray, signals: FloatArray, p: FloatArray, step: float
+        self,
+        where: FloatArray,
+        signals: FloatArray,
+        p: FloatArray,
+        step: float,
+        begin: FloatArray | None = None,
     ) -> FloatArray:
         """States (states, points) along coordinates (coordinates, points) `step` seconds apart,
-        from rest at zero.
+        from rest at zero or from the states (states,) `begin`.
         """
         count = where.shape[1]
         out = np.zeros((self._states, count))
         steps = np.diff(where, axis=1, prepend=where[:, :1])
         # CasADi's own buffers: the conversion of every stretch would cost as much as the law
         z, trail = np.zeros((1, self._states)), np.zeros((UNROLLED, self._states))
+        if begin is not None:
+            z[0] = begin
         many, aside = np.zeros((UNROLLED, where.shape[0])), np.zeros((UNROLLED, len(self._used)))
         given, run = self._stretch.buffer()
         for i, array in enumerate(

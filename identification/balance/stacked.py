@@ -52,6 +52,11 @@ in the third digit.
 """
 NOTHING_SURE: Final = 1e100
 """What a row of which nothing is sure is unsure by at most [N.m]: a number with a square."""
+STILL_KNOWN: Final = 0.1
+"""Share of the most that a beginning gives a row, under which it is forgotten."""
+MOST_OF_A_BEGINNING: Final = 0.05
+"""Rows of a record, as a share, that its beginning may reach: what a twentieth leaves out lets no
+law look better by more than its rows are worth."""
 INDEPENDENT_SHARE: Final = 0.4
 """Share of the rows that count as independent: four rows to a kernel length."""
 SURE_ERRORS: Final = 3.0
@@ -540,12 +545,32 @@ def row_weights(
     sigma: Mapping[str, float] | Mapping[str, FloatArray],
     records: Sequence[WeakRecord],
 ) -> dict[str, FloatArray]:
-    """1/sigma of each row: rows that hang on where exactly friction changes its sign count less
-    (`sigma`: of a balance, or of its rows).
+    """1/sigma of each row: rows that hang on where exactly friction changes its sign, or on what
+    was before the record began, count less (`sigma`: of a balance, or of its rows).
     """
     either = unsure(balances, data, values, records)
+    begun = beginnings(balances, data, values, records)
     support = support_of(records)
-    return {b: support / np.sqrt(sigma[b] ** 2 + either[b] ** 2) for b in either}
+    return {b: support / np.sqrt(sigma[b] ** 2 + either[b] ** 2 + begun[b] ** 2) for b in either}
+
+
+def beginnings(
+    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
+) -> dict[str, FloatArray]:
+    """What each row of a balance hangs on the state in which a law with memory began, (rows,)
+    [N.m]: bristles are bent and elements slipped before a segment of a record begins.
+
+    Where more than a few rows do, the law remembers its beginning for good, as a spring does: that
+    is no beginning, and the rows count as they are.
+    """
+    bare = balances_of(balances.model, data.sensing, wrt=())
+    out: dict[str, list[FloatArray]] = {b: [] for b in bare.balances}
+    for w in records:
+        for b, rows in bare.begun(w, values_on(balances.model, w, values)).items():
+            hanging = np.count_nonzero(rows > STILL_KNOWN * rows.max(initial=0.0))
+            short = hanging <= MOST_OF_A_BEGINNING * w.rows
+            out[b].append(rows if short else np.zeros(w.rows))
+    return {b: np.concatenate(parts) if parts else np.empty(0) for b, parts in out.items()}
 
 
 def support_of(records: Sequence[WeakRecord]) -> FloatArray:

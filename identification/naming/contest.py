@@ -21,6 +21,7 @@ from identification.balance.stacked import (
     LEAST_DEVIATION,
     TURN_WIDTHS,
     apart_from_drift,
+    beginnings,
     drawn_floors,
     drift_memory,
     innovations,
@@ -346,15 +347,15 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
     even the best of them leaves beside noise is the same torque for all: what is more than noise
     may be, whose squares are known to :data:`~identification.balance.colour.LEVEL_ERROR`. Rows that
     may go either way by a law say little against it, and as much as others against one that says
-    which way.
+    which way. What was before a record began is known to no law: rows that hang on it by one count
+    less for all.
     """
     levels = _believable(rivals, data)
-    either = [
-        unsure(
-            balances_of(r.solution.model, data.sensing, wrt=()), data, r.solution.values, data.train
-        )
-        for r in rivals
+    laws = [
+        (balances_of(r.solution.model, data.sensing, wrt=()), r.solution.values) for r in rivals
     ]
+    either = [unsure(law, data, values, data.train) for law, values in laws]
+    begun = [beginnings(law, data, values, data.train) for law, values in laws]
     support = support_of(data.train)
     out: list[dict[str, FloatArray]] = [{} for _ in rivals]
     for b in data.sensing.balances:
@@ -363,6 +364,7 @@ def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArr
             max(0.0, r.solution.sigma[b] ** 2 - (1 + LEVEL_ERROR) * rms(level[b][rows]) ** 2)
             for r, level in zip(rivals, levels, strict=True)
         )
+        beside = beside + np.max([one[b] for one in begun], axis=0) ** 2
         for weight, level, way in zip(out, levels, either, strict=True):
             variance = level[b] ** 2 + beside + way[b] ** 2
             weight[b] = support / np.sqrt(np.maximum(variance, LEAST_DEVIATION**2))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from casadi_models import JointModel
-from identification import Record
+from identification import Record, fit
 from identification.balance.balances import balances_of
 from identification.balance.colour import white
 from identification.balance.dataset import Dataset, load_dataset
@@ -17,6 +18,7 @@ from identification.balance.stacked import (
     _between_samples,
     _either_direction,
     _sure_rms,
+    beginnings,
     drawn_floors,
     drift_rows,
     measured,
@@ -30,7 +32,10 @@ from identification.balance.stacked import (
 from identification.balance.weak import WeakRecord, differentiated_kernel, prepare
 from identification.data.joint_file import Joint
 from identification.fitting.engine import prepared_model
+from identification.fitting.start_values import starts
 from identification.fitting.weak_form import WeakForm
+from tests.identification.fitting.test_dataset import recorded
+from tests.recorded_world.world import make_case
 
 FloatArray = npt.NDArray[np.float64]
 VALUES = {"inertia": 12.0, "motor_viscous": 25.0, "motor_smoothing_velocity": 0.01}
@@ -195,3 +200,35 @@ def test_what_is_known_of_a_parameter_is_a_row_in_its_standard_deviations(unit: 
     (rows,) = {w.rows for w in data.train}
     assert form.residual(x)[rows:] == pytest.approx([2.5])
     assert form.jacobian(x)[rows:] == pytest.approx(np.array([[0.0, 0.5 / unit]]))
+
+
+def test_where_a_memory_began_is_not_known(tmp_path: Path) -> None:
+    """Bristles are bent before a record begins. Four rows of the first start held four fifths of
+    what was left: 4.5 times the noise, and a bristle torque that was 3 % too small.
+    """
+    joint, train, held_out = recorded(288003, "triple", tmp_path)
+    laws = ("gravity", "lugre@motor", "hysteresis", "quadratic_drag@link")
+    effects = tuple(dict.fromkeys((*joint.effects, *laws)))
+    found = fit(replace(joint, effects=effects), [train], held_out=[held_out])
+    true = make_case(288003, kind="triple", size=1.0).values
+    torque = found.solution.values["motor_presliding_torque"]
+    assert torque == pytest.approx(true["M_TC"], rel=0.01)
+    assert found.train.balances["motor"].ratio < 2.0
+
+
+def test_a_law_that_never_forgets_its_beginning_has_none(tmp_path: Path) -> None:
+    """Elements that never slip are a spring: rows that count less for it made it the best name of a
+    pendulum's gravity.
+    """
+    joint, train, held_out = recorded(288003, "triple", tmp_path)
+    model = prepared_model(joint, train).add("hysteresis")
+    data = load_dataset([train], [held_out], joint, model)
+    balances = balances_of(model, data.sensing, wrt=())
+    started = {**starts(model, data), "stiffness": 298.0, "hysteresis_torque_1": 0.2}
+
+    def reached(width: float) -> int:
+        values = {**started, "hysteresis_width": width, "hysteresis_spread": 2.3}
+        return int(np.count_nonzero(beginnings(balances, data, values, data.train)["transmission"]))
+
+    assert 0 < reached(0.0013) < 0.05 * data.train[0].rows
+    assert reached(1.0) == 0

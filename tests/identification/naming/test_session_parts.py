@@ -264,7 +264,7 @@ class World:
     def slower(self, factor: float) -> World | None:
         return self.longer.get(factor)
 
-    def drifts(self, step: Step) -> dict[str, Any]:
+    def slow_noise(self, step: Step) -> dict[str, Any]:
         return {}
 
     def left_open(self, step: Step) -> dict[str, Any]:
