@@ -302,7 +302,8 @@ class Balances:
         def rows() -> FloatArray:
             rest = self.memory_values(data, values)
             most = np.abs(rest).max(axis=1, initial=0.0)
-            moved = memory.along(data, np.array(p), most)
+            law = ("begun", self._law, tuple(p[i] for i in memory.depends))
+            moved = states_of(data, law, lambda: memory.along(data, np.array(p), most))
             return self._rows(data, moved, p) - self._rows(data, rest, p)
 
         full = np.abs(residuals_of(data, ("begun", self.law, self.wrt, p), rows))

@@ -55,6 +55,8 @@ STANDS_OUT: Final = 40.0
 """Power of a line over the median around it: noise reaches it once in 1e12 frequencies."""
 AROUND: Final = 40
 """Frequencies, in those that the record resolves, on either side that make this median."""
+WIDTH: Final = 3
+"""Half the width of a line after the window, in the same."""
 PURE: Final = 0.9
 """Share of the power around a line that it must hold itself: that of a vibration of the joint
 wanders with its motion."""
@@ -68,9 +70,6 @@ MOST_LINES: Final = 4
 MOST_TAKEN: Final = 3 * MOST_LINES
 """Frequencies at most that are taken off one after the other: twice as many of a vibration, which
 is none, as of lines."""
-NEAR_ENOUGH: Final = 0.01
-"""Places of a spectrum to which a frequency is sought: a line is off by a hundredth of a turn at
-the end of a course."""
 LEAKING: Final = 1e-4
 """Power of a line under which one near it is what it leaves of itself: its windowed course is
 followed to a hundredth."""
@@ -402,34 +401,69 @@ def lines_in(
     def spectrum(values: FloatArray) -> FloatArray:
         return np.asarray(np.abs(np.fft.rfft(values * window)) ** 2)
 
+    seen = kept * window
     rest = np.where(kept, course - np.mean(course, where=kept), 0.0) if kept.any() else course * 0.0
-    taken: list[tuple[int, float, FloatArray]] = []
+    taken: list[_Line] = []
     for _ in range(MOST_TAKEN):
         power = spectrum(rest)
         place = _highest(power, first)
         if place is None:
             break
-        frequency = _refined(rest * window, place, dt)
-        line = _line_of(rest, kept * window, frequency, dt)
-        taken.append((place, frequency, line))
+        at = _peak(power, place)
+        line = _line_of(rest, seen, at)
+        taken.append(_Line(place, at / (count * dt), line, float(spectrum(line).sum())))
         rest = rest - line
-    power, found = spectrum(rest), []
-    sizes = [float(spectrum(line).sum()) for *_, line in taken]
-    for (place, frequency, line), own in zip(taken, sizes, strict=True):
-        near = slice(place - AROUND, place + AROUND + 1)
-        if any(
-            own < LEAKING * other and abs(place - at) <= AROUND
-            for (at, *_), other in zip(taken, sizes, strict=True)
-        ):
-            continue
-        usual = float(np.median(power[near])) / math.log(2)
+    lines = [x for x in taken if not any(y.hides(x) for y in taken)]
+    while True:
+        # what is no line of its own is rest beside the others
+        power = spectrum(rest + sum(x.course for x in taken if x not in lines))
+        pure = [x for x in lines if x.is_pure_in(power)]
+        if len(pure) == len(lines):
+            break
+        lines = pure
+    return [
+        (math.sqrt(2.0 * float(np.average(x.course**2, weights=seen**2))), x.frequency)
+        for x in lines
+    ]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A line as it was taken off a course.
+
+    Attributes
+    ----------
+    place : int
+        Of its peak in the spectrum.
+    frequency : float
+        [Hz].
+    course : (n,) array
+    power : float
+        Sum of its windowed spectrum.
+    """
+
+    place: int
+    frequency: float
+    course: FloatArray
+    power: float
+
+    def hides(self, other: _Line) -> bool:
+        """Whether the other is a part of this one: nearer than the window resolves, or what was
+        left of it."""
+        apart = abs(self.place - other.place)
+        return self.power > other.power and (
+            (apart <= 2 * WIDTH and self is not other)
+            or (apart <= AROUND and other.power < LEAKING * self.power)
+        )
+
+    def is_pure_in(self, rest: FloatArray) -> bool:
+        """Whether it holds the power around it, beside the spectrum of what is left."""
+        near = rest[self.place - AROUND : self.place + AROUND + 1]
+        usual = float(np.median(near)) / math.log(2)
         # noise alone is over its mean by one in e of it
-        over = float(np.maximum(power[near] - usual, 0.0).sum())
-        over -= (2 * AROUND + 1) * usual / math.e
-        if own >= PURE * (own + max(over, 0.0)):
-            size = math.sqrt(2.0 * float(np.average(line**2, weights=(kept * window) ** 2)))
-            found.append((size, frequency))
-    return found
+        over = float(np.maximum(near - usual, 0.0).sum()) - len(near) * usual / math.e
+        return self.power >= PURE * (self.power + max(over, 0.0))
 
 
 def _highest(power: FloatArray, first: int) -> int | None:
@@ -437,41 +471,34 @@ def _highest(power: FloatArray, first: int) -> int | None:
     inner = power[first:-AROUND]
     if not len(inner):
         return None
-    least = STANDS_OUT * float(np.median(power[first:]))
-    for k in np.argsort(-inner) + first:
-        if power[k] <= least:
-            break
+    high = np.flatnonzero(inner > STANDS_OUT * float(np.median(power[first:]))) + first
+    for k in high[np.argsort(-power[high])]:
         near = power[k - AROUND : k + AROUND + 1]
         if power[k] >= max(float(near.max()), STANDS_OUT * float(np.median(near))):
             return int(k)
     return None
 
 
-def _refined(values: FloatArray, place: int, dt: float) -> float:
-    """Frequency [Hz] at which the spectrum of windowed values is highest near a place of it."""
-    from scipy.optimize import minimize_scalar
-
-    turns = 2j * np.pi * np.arange(len(values)) / len(values)
-    found = minimize_scalar(
-        lambda at: -float(abs(values @ np.exp(-turns * at))),
-        bounds=(place - 1.0, place + 1.0),
-        method="bounded",
-        options={"xatol": NEAR_ENOUGH},
-    )
-    return float(found.x) / (len(values) * dt)
+def _peak(power: FloatArray, place: int) -> float:
+    """Where a line lies whose windowed spectrum peaks at that place, by a parabola through the
+    logarithms: right within a hundredth of a place for this window, a tenth where gaps spread it.
+    """
+    low, top, high = np.log(np.maximum(power[place - 1 : place + 2], 1e-300))
+    bend = low - 2 * top + high
+    return place + (0.5 * float((low - high) / bend) if bend < 0 else 0.0)
 
 
-def _line_of(values: FloatArray, window: FloatArray, frequency: float, dt: float) -> FloatArray:
-    """The part (n,) of windowed values that holds a frequency to within what the course resolves;
+def _line_of(values: FloatArray, window: FloatArray, at: float) -> FloatArray:
+    """The part (n,) of windowed values that turns `at` times over the course, to within one turn;
     zero where the window is.
     """
-    time = dt * np.arange(len(values))
-    beside = np.array([-1.0, 0.0, 1.0]) / (len(values) * dt)
-    turns = 2.0 * np.pi * np.outer(time, frequency + beside)
-    columns = np.concatenate([np.cos(turns), np.sin(turns)], axis=1)
-    seen = columns * window[:, None]
-    amplitudes = np.linalg.lstsq(seen.T @ seen, seen.T @ (window * values), rcond=None)[0]
-    return np.asarray((columns @ amplitudes) * (window != 0))
+    once = 2j * np.pi / len(values) * np.arange(len(values))
+    wave, turn = np.exp(at * once), np.exp(once)
+    waves = [wave * turn.conj(), wave, wave * turn]
+    columns = np.stack([part for x in waves for part in (x.real, x.imag)])
+    seen = columns * window
+    amplitudes = np.linalg.lstsq(seen @ seen.T, seen @ (window * values), rcond=None)[0]
+    return np.asarray((amplitudes @ columns) * (window != 0))
 
 
 __all__ = ["MOST_LINES", "ChannelNoise", "Part", "coloured", "lines_in", "spacings_of", "white"]

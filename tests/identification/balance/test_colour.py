@@ -150,6 +150,16 @@ def test_hum_is_told_from_noise_and_a_motion_has_none() -> None:
     assert read(torque + 3.0 * np.convolve(knocks, ring)[:COUNT]).lines == ()
 
 
+@pytest.mark.parametrize(("wander", "many"), [(0.03, 1), (0.5, 0)])
+def test_a_line_that_wanders_is_one_or_none(wander: float, many: int) -> None:
+    """By more than the record resolves [Hz] it is no line, however many parts of it stand out."""
+    rng, count, dt = np.random.default_rng(7), 40_000, 1e-3
+    course = np.cumsum(rng.standard_normal(count))
+    course = (course - course.mean()) / course.std()
+    mains = np.sin(2 * np.pi * np.cumsum(50.0 + wander * course) * dt)
+    assert len(lines_in(rng.standard_normal(count) + mains, dt, 33.0)) == many
+
+
 @pytest.mark.parametrize("stops", [False, True])
 def test_lines_that_beat_are_two_and_a_hump_is_none(stops: bool) -> None:
     """Each made the other impure; what is left out of a stop spreads a line."""
@@ -159,7 +169,7 @@ def test_lines_that_beat_are_two_and_a_hump_is_none(stops: bool) -> None:
     noise = 0.02 * rng.standard_normal(len(time))
     beating = 0.05 * np.sin(2 * np.pi * 11.57 * time) + 0.03 * np.sin(2 * np.pi * 10.97 * time)
     found = lines_in(np.where(kept, noise + beating, 0.0), dt, 5.0, kept)
-    assert sorted(f for _, f in found) == pytest.approx([10.97, 11.57], abs=0.002)
+    assert sorted(f for _, f in found) == pytest.approx([10.97, 11.57], abs=0.005)
     assert sorted(size for size, _ in found) == pytest.approx([0.03, 0.05], rel=0.1)
     pole = 0.99 * np.exp(2j * np.pi * 11.0 * dt)
     hump = lfilter([1.0], [1.0, -2 * pole.real, abs(pole) ** 2], rng.standard_normal(len(time)))
