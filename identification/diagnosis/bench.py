@@ -4,6 +4,7 @@ interface.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -12,7 +13,7 @@ from typing import Protocol, final
 import numpy as np
 
 from casadi_models import JointModel
-from identification.balance.calibration import settled
+from identification.balance.calibration import is_of_run, settled
 from identification.balance.dataset import FEWEST_ROWS, without
 from identification.balance.sensing import Sensing
 from identification.balance.slow_noise import SlowNoise
@@ -338,17 +339,37 @@ class JointBench:
             self._readings[mark] = slow if believed else {}
             over = frozenset(b for b, e in out.items() if e.ratio > RATIO_LIMIT)
             if over and held_out:
-                left_open = LeftOpen.of(solution, self.data, values, over)
-                for length in self._lengths(over):
-                    told = self._errors_at(
-                        length, solution.model, values, held_out=True, left_open=left_open
-                    )
-                    # as a slow noise: what is not explained whole is left as it is
-                    out |= {b: e for b, e in told.items() if b in over and e.ratio <= RATIO_LIMIT}
+                out |= self._beside(LeftOpen.of(solution, self.data, values, over), solution)
             # the solution is kept with its ratios: an identity is not given to another while it
             # lives
             self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
         return dict(self._ratios[mark][1])
+
+    def _beside(self, left_open: LeftOpen, solution: Solution) -> dict[str, BalanceError]:
+        """Errors of the balances that are explained by what a fit leaves open, each whole: as with
+        a slow noise, others are left as they are.
+        """
+        out: dict[str, BalanceError] = {}
+        values = self._settled(solution)
+
+        def ask(given: LeftOpen) -> None:
+            for length in self._lengths(given.asked):
+                told = self._errors_at(
+                    length, solution.model, values, held_out=True, left_open=given
+                )
+                out.update(
+                    {b: e for b, e in told.items() if b in given.asked and e.ratio <= RATIO_LIMIT}
+                )
+
+        ask(left_open)
+        rest = left_open.asked - set(out)
+        free = [n for n in solution.free if not is_of_run(n)]
+        if rest and any((solution.stderr[n] or math.inf) >= abs(solution.values[n]) for n in free):
+            # what is not told may be far from here: all records together know a place
+            every = (*self.data.train, *self.data.held_out)
+            whole = solve(solution.model, replace(self.data, train=every, held_out=()))
+            ask(replace(left_open, asked=rest, elsewhere=whole.values))
+        return out
 
     def _settled(self, solution: Solution) -> Mapping[str, float]:
         """Values of a solution; zero and clocks of a record, too, are its own and found at the

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, final
 
@@ -93,6 +93,9 @@ class LeftOpen:
     told : (unknowns, unknowns) array
         What a step of the unknowns of `here` is multiplied by, so that the rows fall behind by as
         much as they tell of it without noise: an acceleration that is all noise tells no inertia.
+    elsewhere : mapping of str to float
+        Values of another place in that valley, where steps are looked for, too; those of the runs
+        as well.
     """
 
     names: tuple[str, ...]
@@ -100,6 +103,7 @@ class LeftOpen:
     here: WeakForm
     limits: Mapping[str, tuple[float, float]]
     told: FloatArray
+    elsewhere: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def clear_of_noise(self) -> bool:
@@ -169,16 +173,28 @@ class LeftOpen:
             names = problem.names
             start = problem.start
             clear = not balances.has_gap and self.clear_of_noise
-            if clear and problem.at_least(start) > FAR**2:
-                continue  # however free they were
-            found = least_squares(
-                problem,
-                start,
-                ([limits[n][0] for n in names], [limits[n][1] for n in names]),
-                logarithmic=problem.logarithmic,
-                iterations=ITERATIONS,
-                tolerance=ENOUGH,
-            ).x
+            within = [limits[n][0] for n in names], [limits[n][1] for n in names]
+            starts = [start]
+            if self.elsewhere:
+                starts.append(np.clip([self.elsewhere[n] for n in names], *within))
+            # the others stay too far, however free the unknowns were
+            starts = [x for x in starts if not clear or problem.at_least(x) <= FAR**2]
+            if not starts:
+                continue
+            found = min(
+                (
+                    least_squares(
+                        problem,
+                        begin,
+                        within,
+                        logarithmic=problem.logarithmic,
+                        iterations=ITERATIONS,
+                        tolerance=ENOUGH,
+                    ).x
+                    for begin in starts
+                ),
+                key=problem.size,
+            )
             moved = problem.columns(found)[:, : len(every)] * (found - start)[: len(every)]
             each = np.linalg.norm(moved[:, len(runs) :], axis=0)
             leading = each > LEADING * each.max(initial=0.0)
@@ -297,6 +313,10 @@ class _Beside:
     def residual(self, x: FloatArray) -> FloatArray:
         """Weighted rows, and what is lost elsewhere."""
         return np.concatenate([self.left(x) * self.there.weights[self.balance], self.lost(x)])
+
+    def size(self, x: FloatArray) -> float:
+        """Norm of these."""
+        return float(np.linalg.norm(self.residual(x)))
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """Their derivative."""

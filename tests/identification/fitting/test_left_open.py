@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification import Joint, load_joint, read
+from identification import Joint, improve, load_joint, read
 from identification.balance.calibration import settled
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.excitation import attenuation, excitation_warnings
@@ -118,6 +118,22 @@ def test_a_gap_that_no_training_row_crosses_moves_with_the_zero_of_its_flank(
     assert plain.ratio > 10
     assert beside.ratio < 1.3
     assert beside.left_open == ("backlash",)
+
+
+def test_all_records_together_know_a_place_in_the_valley_that_is_far(tmp_path: Path) -> None:
+    """A gap that the training rows do not cross may read as none at all, its stiffness as much as
+    its width; no step from there leads to the gap that the held-out record crosses.
+    """
+    folder = write_case(make_case(299002, kind="none", without=("dirt",)), tmp_path, "all")
+    joint = load_joint(folder / "joint.toml")
+    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    model = prepared_model(joint, train)
+    data = load_dataset([train], [held], joint, model)
+    _, beside = errors(first_fit(model, data), data, "transmission")
+    assert beside.ratio > 10
+    answer = improve(train, joint, [held])
+    assert answer.verdict == "nothing_missing"
+    assert any("leave open of backlash_stiffness_loss" in w for w in answer.warnings)
 
 
 def test_no_step_is_looked_for_where_none_can_be_near() -> None:
