@@ -63,6 +63,8 @@ over some thousand rows."""
 MOST_HIDDEN: Final = 2.0
 """Times what noise hides in the direction that holds most of it: other directions hide some, too,
 and a correction that diverges leaves powers of ten more."""
+FARTHEST: Final = 2.0
+"""Factor by which such a correction may move a scale: farther off its column is another one."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
 
@@ -75,7 +77,7 @@ def unbiased(
 
     The correction is one of first order. Where it leaves more than noise can have hidden, which is
     what it has of the directions and never more than all of it, a law bent under it: then shapes
-    stay, or all of it is left out. Where other sensors meet the columns
+    stay, or all of it is left out. A scale that would move far stays. Where other sensors meet the columns
     of a balance, its residual must stay as near to its floor as it was: a motion that tells a value
     neither way sends it anywhere.
 
@@ -105,8 +107,13 @@ def unbiased(
     began = start.rows @ start.rows
     better = _worth_it(start, bounds, moves, share)
     for equations in dict.fromkeys((better, start)):
-        for moving in (moves, moves & ~problem.bent):
+        ways = [moves & ~problem.bent, moves]
+        while ways:
+            moving = ways.pop()
             found = equations.solved(bounds, moving)
+            if (far := found.far_from(start)).any():
+                ways += [moves & ~far] if moving is moves else []
+                continue
             # where it began: a correction that ran away may end where all is noise
             share = equations.largest_share(moving)
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
@@ -185,6 +192,14 @@ class _Equations:
         if self.instruments is None:
             return own, None
         return own, self.turns.without(self.instruments.beside(plain, self.problem))
+
+    def far_from(self, start: _Equations) -> npt.NDArray[np.bool_]:
+        """Scales that are not nearly what they were, (free,)."""
+        far = np.zeros(len(self.x), dtype=np.bool_)
+        scales = start.problem.logarithmic
+        ratio = self.x[scales] / start.x[scales]
+        far[scales] = (ratio > FARTHEST) | (ratio * FARTHEST < 1.0)
+        return far
 
     def as_near_as(self, start: _Equations) -> bool:
         """Whether the balances that other sensors meet are left no farther above their floors than
