@@ -13,7 +13,7 @@ from typing import Protocol, final
 import numpy as np
 
 from casadi_models import JointModel
-from identification.balance.calibration import is_of_run, settled
+from identification.balance.calibration import settled
 from identification.balance.dataset import FEWEST_ROWS, without
 from identification.balance.sensing import Sensing
 from identification.balance.slow_noise import SlowNoise
@@ -363,11 +363,17 @@ class JointBench:
 
         ask(left_open)
         rest = left_open.asked - set(out)
-        free = [n for n in solution.free if not is_of_run(n)]
-        if rest and any((solution.stderr[n] or math.inf) >= abs(solution.values[n]) for n in free):
-            # what is not told may be far from here: all records together know a place
+        model = solution.model
+        valleys = {n for t in model.terms if t.effect.several_valleys for n in t.names}
+        untold = [
+            n
+            for n in valleys & set(solution.free)
+            if (solution.stderr[n] or math.inf) >= abs(solution.values[n])
+        ]
+        if rest and untold:
+            # steps do not lead out of a valley: all records together may know another
             every = (*self.data.train, *self.data.held_out)
-            whole = solve(solution.model, replace(self.data, train=every, held_out=()))
+            whole = solve(model, replace(self.data, train=every, held_out=()))
             ask(replace(left_open, asked=rest, elsewhere=whole.values))
         return out
 

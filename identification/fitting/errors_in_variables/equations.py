@@ -77,9 +77,9 @@ def unbiased(
 
     The correction is one of first order. Where it leaves more than noise can have hidden, which is
     what it has of the directions and never more than all of it, a law bent under it: then shapes
-    stay, or all of it is left out. A scale that would move far stays. Where other sensors meet the columns
-    of a balance, its residual must stay as near to its floor as it was: a motion that tells a value
-    neither way sends it anywhere.
+    stay, or all of it is left out. A scale that would move far stays. Where other sensors meet the
+    columns of a balance, its residual must stay as near to its floor as it was: a motion that tells
+    a value neither way sends it anywhere.
 
     The clocks follow from rows within which the joint does not turn: where dry friction turns, the
     torque hangs on the very instant of the turn.  For the others these instants are unknown.

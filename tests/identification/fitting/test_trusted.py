@@ -65,6 +65,19 @@ def test_an_exponent_does_not_run_off_from_a_fine_encoder(monkeypatch: pytest.Mo
     assert values["motor_stribeck_velocity"] == pytest.approx(found.parameters["M_VS"], rel=0.02)
 
 
+def test_a_law_that_few_reversals_show_does_not_run_off_where_noise_is_taken_off() -> None:
+    """Its torque went to fifty times the truth, its velocity to a thirtieth of it."""
+    found = simulate_case("stribeck", 7000, records=("train",))
+    joint = joint_of(found, ("stribeck@motor",))
+    records = [record_of(table, name, "same") for name, table in found.measured.items()]
+    model = prepared_model(joint, records[0])
+    solution = solve(model, load_dataset(records, [], joint, model))
+    for name, key in (("motor_stribeck_extra", "M_TS"), ("motor_stribeck_velocity", "M_VS")):
+        true, error = found.parameters[key], solution.stderr[name]
+        assert error is not None
+        assert abs(solution.values[name] - true) < min(2 * error, 0.2 * true)
+
+
 def test_most_intervals_hold_the_truth_and_none_is_far_off() -> None:
     truth = {**PLAIN, "motor_stribeck_extra": "M_TS", "motor_stribeck_velocity": "M_VS"}
     inside = []
