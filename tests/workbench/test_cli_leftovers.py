@@ -633,3 +633,38 @@ def test_tables_of_a_notebook_have_space_between_their_cells_and_units_as_in_the
         cells = re.findall(r"<t[dh][ >][^>]*", result._repr_html_())
         assert cells
         assert all("padding" in cell for cell in cells)
+
+
+DROPS = """
+import signal
+from irj_fmu.command_line import STOPPED
+from workbench.cli import main as cli
+
+class Drops:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+class Fails:
+    def __del__(self):
+        raise ValueError("said")
+
+with cli._watched_interrupt():
+    Drops()
+    assert STOPPED == [signal.SIGINT]
+    Fails()
+"""
+
+
+def test_an_interrupt_that_a_library_drops_is_noted_and_no_trace_is_printed() -> None:
+    """It came within compiled code that goes on after any exception; what reports it is the
+    interpreter, beside the one line of ours.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", DROPS],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        check=True,
+    )
+    assert "KeyboardInterrupt" not in done.stderr
+    assert "ValueError: said" in done.stderr

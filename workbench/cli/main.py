@@ -757,11 +757,20 @@ def _watched_interrupt() -> Iterator[None]:
         STOPPED.append(number)
         signal.default_int_handler(number, frame)
 
+    before = sys.unraisablehook
+
+    def lost(error: Any) -> None:
+        # compiled code of a library may drop the interrupt that came within it; it is noted
+        if not (issubclass(error.exc_type, KeyboardInterrupt) and signal.SIGINT in STOPPED):
+            before(error)
+
     signal.signal(signal.SIGINT, note)
+    sys.unraisablehook = lost
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = before
 
 
 def _register(files: Sequence[str]) -> None:
