@@ -101,6 +101,9 @@ class Bench(Protocol):
         signal.
         """
 
+    def beside(self, step: Step, slow: Mapping[str, SlowNoise]) -> Error:
+        """Errors of a step on held-out records whose readings drift and hum by as much."""
+
     def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
         """Parameters whose errors explain what a balance leaves on held-out records over the
         noise, by balance.
@@ -293,9 +296,7 @@ class JointBench:
         ratios = {b: e.ratio for b, e in verdict.items()}
         slow = self._readings[id(solution), held_out]
         if slow:
-            data = self.data.with_slow_noise(slow)
-            records = data.held_out if held_out else data.train
-            louder = assess(solution.model, data, records, self._settled(solution)).balances
+            louder = self._beside_slow(solution, slow, held_out=held_out).balances
             error = replace(
                 error,
                 balances={
@@ -411,6 +412,17 @@ class JointBench:
         """Drift and hum that a fitted model shows and that explain a ratio, by signal."""
         self._judged(step.solution, held_out=True)
         return self._readings[id(step.solution), True]
+
+    def beside(self, step: Step, slow: Mapping[str, SlowNoise]) -> Error:
+        """Errors on held-out records where the readings are as slow."""
+        return self._beside_slow(step.solution, slow, held_out=True)
+
+    def _beside_slow(
+        self, solution: Solution, slow: Mapping[str, SlowNoise], *, held_out: bool
+    ) -> Error:
+        data = self.data.with_slow_noise(slow)
+        records = data.held_out if held_out else data.train
+        return assess(solution.model, data, records, self._settled(solution))
 
     def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
         """Parameters whose errors explain what a balance leaves on held-out records."""

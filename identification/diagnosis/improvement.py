@@ -32,6 +32,9 @@ SPOILT_RATIO: Final = 1.3
 """Ratio to the floor up to which a balance that has risen is still noise: floors hold within
 some 10 to 20 %.
 """
+MOST_DRIFT: Final = 0.5
+"""Share of the noise's squares from which on its RMS over a record is that of one course of drift,
+anything from a third to twice what is expected."""
 RISE_LIMIT: Final = 1.02
 """Rise of the relative held-out error that an addition may cause."""
 
@@ -320,14 +323,19 @@ def judged_drop(before: Error, after: Error, balance: str) -> float:
     In a balance that is noise before and after it is in units of the noise that each model passes
     on: a gain that stands for an inertia takes the noise of an encoder away and explains nothing.
     A floor that is lower because the records leave less than such noise is no unit: then structure
-    was read as noise, as a fast ripple is, and the addition takes it off.
+    was read as noise, as a fast ripple is, and the addition takes it off. Where most of the noise
+    is a drift, a record holds one course of it, which any law may follow a little: then what the
+    drift does not foretell must fall as well.
     """
     old, new = common_rms(before, after, balance)
     one, two = before.balances[balance], after.balances[balance]
     passed = one.floor / max(one.believed, 1e-300), two.floor / max(two.believed, 1e-300)
-    noise = max(one.ratio, two.ratio) <= RATIO_LIMIT and 0 < passed[1] < passed[0]
-    unit = passed[1] / passed[0] if noise else 1.0
-    return 100 * (1 - new / (old * unit)) if old > 0 else 0.0
+    noise = max(one.ratio, two.ratio) <= RATIO_LIMIT
+    unit = passed[1] / passed[0] if noise and 0 < passed[1] < passed[0] else 1.0
+    fall = 1 - new / (old * unit) if old > 0 else 0.0
+    if noise and one.drifting > MOST_DRIFT:
+        fall = min(fall, 1 - two.ratio / max(one.ratio, 1e-300))
+    return 100 * fall
 
 
 def held_drop(before: Error, after: Error, balance: str) -> float:

@@ -368,7 +368,7 @@ class Session:
                 continue
             after = self.bench.added(best, standing.now)
             drop = held_drop(standing.now.held_out, after.held_out, claim.balance)
-            fall = judged_drop(standing.now.held_out, after.held_out, claim.balance)
+            fall = self._fall(standing.now, after, claim.balance)
             asked = f"on held-out records after the whole fit ({LEAST_ADDED_DROP:g} % asked)"
             little = (
                 f"lowers the {claim.balance} balance by {fall:.2g} % {asked}"
@@ -614,6 +614,16 @@ class Session:
             warnings=(*excitation_warnings(self.data), *self._warnings),
             refused=(),
         )
+
+    def _fall(self, now: Step, after: Step, balance: str) -> float:
+        """Fall of the held-out RMS by which a whole fit is judged [%]: beside a slow noise that
+        explains what was left, too.
+        """
+        fall = judged_drop(now.held_out, after.held_out, balance)
+        if slow := self.bench.slow_noise(now):
+            pair = [self.bench.beside(step, slow) for step in (now, after)]
+            fall = min(fall, judged_drop(pair[0], pair[1], balance))
+        return fall
 
     def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
         """A candidate that fails on held-out records in its linear form only is judged by a

@@ -98,6 +98,8 @@ class BalanceError:
     believed : float
         Share of the noise that the model passes on which what it leaves of the training records
         allows; the floor is lowered by it.
+    drifting : float
+        Share of the noise's squares that are a drift of a measured torque: of one course of it.
     """
 
     rms: float
@@ -108,6 +110,7 @@ class BalanceError:
     weight: FloatArray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
     left_open: tuple[str, ...] = field(default=(), repr=False, compare=False)
     believed: float = field(default=1.0, repr=False, compare=False)
+    drifting: float = field(default=0.0, repr=False, compare=False)
 
     def as_json(self) -> dict[str, Any]:
         """The shape of `improve --json`."""
@@ -249,6 +252,7 @@ def assess(
     over = {b: np.where(rows[b], beside[b] * wide[b], 0.0) for b in balances.balances}
     powers = _powers(over, wide, rows, turning)
     ratios = {b: math.sqrt(powers[b] + prices[b]) for b in whole}
+    drifting = {b: min(rms(drift[b][rows[b]] * weights[b]) ** 2, 1.0) for b in whole}
     if memory := drift_memory(data):
         scatter = {b: apart_from_drift(1 / wide[b], drift[b], quick[b]) for b in whole}
         courses = {
@@ -263,10 +267,9 @@ def assess(
         }
         powers = _powers(courses, {b: 1 / x for b, x in scatter.items()}, rows, turning)
         for b, ratio in ratios.items():
-            share = rms(drift[b][rows[b]] * weights[b]) ** 2
             ratios[b] = max(
                 math.sqrt(powers[b] + prices[b]),
-                ratio / math.sqrt(1 + min(share, 1.0) * (WALK - 1)),
+                ratio / math.sqrt(1 + drifting[b] * (WALK - 1)),
             )
     floor = {b: f[rows[b]] for b, f in floor.items()}
     errors = {
@@ -279,6 +282,7 @@ def assess(
             weight=weights[b],
             left_open=steps[b].names if b in steps else (),
             believed=believed[b],
+            drifting=drifting[b],
         )
         for b in balances.balances
     }

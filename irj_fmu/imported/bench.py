@@ -429,6 +429,10 @@ class FmuBench:
         """None: how a kinematic error acts on the torques is the FMU's."""
         return None
 
+    def beside(self, step: Step, slow: Mapping[str, SlowNoise]) -> Error:
+        """As the step has them: no slow noise is asked for."""
+        return step.held_out
+
     def left_open(self, step: Step) -> Mapping[str, tuple[str, ...]]:
         """None: what is left is judged on the outputs."""
         return {}
