@@ -340,13 +340,13 @@ class JointBench:
             self._readings[mark] = slow if believed else {}
             over = frozenset(b for b, e in out.items() if e.ratio > RATIO_LIMIT)
             if over and held_out:
-                out |= self._beside(LeftOpen.of(solution, self.data, values, over), solution)
+                out |= self._beside_open(LeftOpen.of(solution, self.data, values, over), solution)
             # the solution is kept with its ratios: an identity is not given to another while it
             # lives
             self._ratios[mark] = solution, {b: out[b] for b in self.data.sensing.balances}
         return dict(self._ratios[mark][1])
 
-    def _beside(self, left_open: LeftOpen, solution: Solution) -> dict[str, BalanceError]:
+    def _beside_open(self, left_open: LeftOpen, solution: Solution) -> dict[str, BalanceError]:
         """Errors of the balances that are explained by what a fit leaves open, each whole: as with
         a slow noise, others are left as they are.
         """
@@ -364,12 +364,10 @@ class JointBench:
 
         ask(left_open)
         rest = left_open.asked - set(out)
-        model = solution.model
+        model, free = solution.model, set(solution.free)
         valleys = {n for t in model.terms if t.effect.several_valleys for n in t.names}
         untold = [
-            n
-            for n in valleys & set(solution.free)
-            if (solution.stderr[n] or math.inf) >= abs(solution.values[n])
+            n for n in valleys & free if (solution.stderr[n] or math.inf) >= abs(solution.values[n])
         ]
         if rest and untold:
             # steps do not lead out of a valley: all records together may know another

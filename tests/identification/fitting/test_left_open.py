@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification import Joint, improve, load_joint, read
+from identification import Joint, Record, improve, load_joint, read
 from identification.balance.calibration import settled
 from identification.balance.dataset import Dataset, load_dataset, prepared_model
 from identification.balance.excitation import attenuation, excitation_warnings
@@ -18,7 +18,7 @@ from identification.fitting.left_open import FAR, LeftOpen
 from tests.identification.diagnosis.test_session import at_one_speed, wave
 from tests.identification.fitting.test_errors_in_variables import JOINT as ARM
 from tests.identification.fitting.test_errors_in_variables import run
-from tests.recorded_world.world import make_case, write_case
+from tests.recorded_world.world import Case, make_case, write_case
 from tests.smooth_laws import nothing, record
 
 JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb", "quadratic_drag"))
@@ -34,6 +34,14 @@ def errors(found: Solution, data: Dataset, balance: str) -> tuple[BalanceError, 
         for x in (None, given)
     )
     return plain, beside
+
+
+def written(case: Case, folder: Path) -> tuple[Joint, Record, Record]:
+    """The joint of a case, its training and its held-out record, with all sensors."""
+    place = write_case(case, folder, "all")
+    joint = load_joint(place / "joint.toml")
+    train, held = (read(place / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    return joint, train, held
 
 
 def ratios(seed: int) -> tuple[float, float]:
@@ -108,10 +116,8 @@ def test_a_gap_that_no_training_row_crosses_moves_with_the_zero_of_its_flank(
     """On one flank a gap is a zero of the link's encoder, so nothing tells its size, and records
     that cross it stand far over the noise until both may move.
     """
-    case = make_case(240002, kind="none")  # backlash, listed three times too wide
-    folder = write_case(case, tmp_path, "all")
-    joint = load_joint(folder / "joint.toml")
-    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    # backlash, listed three times too wide
+    joint, train, held = written(make_case(240002, kind="none"), tmp_path)
     model = prepared_model(joint, train)
     data = load_dataset([train], [held], joint, model)
     plain, beside = errors(first_fit(model, data), data, "transmission")
@@ -124,9 +130,8 @@ def test_all_records_together_know_a_place_in_the_valley_that_is_far(tmp_path: P
     """A gap that the training rows do not cross may read as none at all, its stiffness as much as
     its width; no step from there leads to the gap that the held-out record crosses.
     """
-    folder = write_case(make_case(299002, kind="none", without=("dirt",)), tmp_path, "all")
-    joint = load_joint(folder / "joint.toml")
-    train, held = (read(folder / f"{n}.csv", joint=joint) for n in ("train", "test"))
+    case = make_case(299002, kind="none", without=("dirt",))
+    joint, train, held = written(case, tmp_path)
     model = prepared_model(joint, train)
     data = load_dataset([train], [held], joint, model)
     _, beside = errors(first_fit(model, data), data, "transmission")
