@@ -456,7 +456,7 @@ def pictures(folder: Path) -> None:
             step("#fit", "compare")
             page.screenshot(
                 path=str(folder / "page-compare.png"),
-                clip={"x": 0, "y": 102, "width": 1000, "height": 740},
+                clip={"x": 0, "y": 102, "width": 1000, "height": 755},
             )
             step("#diagnose", "diagnose")
             step("button.primary:has-text('Add')", "ledger")
