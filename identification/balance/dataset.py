@@ -61,7 +61,7 @@ SHORT_KERNELS: Final = (2, 4)
 """Kernels in samples: a fine encoder needs no longer one, and every kernel rounds off the turn at
 which friction changes its sign within a sample."""
 SHORT_NOISE: Final = 2e-4
-"""Noise of the velocity by the shortest, as a share of the record's speed: friction changes its
+"""Noise of the velocity by such a kernel, as a share of the record's speed: friction changes its
 sign over a hundredth of that speed and less, and rest is told from motion there."""
 STILL: Final = 3.0
 """Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
@@ -76,9 +76,8 @@ kernel of the verdict.
 TWIST_NOISE: Final = 5e-4
 """Noise of the torsion that a law with memory may follow, as a share of the torsion's size: a tenth
 of the narrowest width that is tried for such a law."""
-VELOCITY_NOISE: Final = 4e-3
-"""Noise of a pointwise velocity, as a share of the record's speed, that is small enough: what a
-longer kernel takes off a reversal does more to the velocity of a Stribeck law and to an inertia."""
+VELOCITY_NOISE: Final = 2e-3
+"""Noise of a pointwise velocity, as a share of the record's speed, that is small enough."""
 
 
 @final
@@ -583,9 +582,8 @@ def pointwise_kernel(
         or [np.zeros(1)]
     )
     fast = float(np.quantile(change, 0.99)) / (lag * dt)
-    shortest, short = (n * dt for n in SHORT_KERNELS)
-    longer = [short, *(x for x in POINTWISE_KERNELS if x >= 6 * dt)]
-    for length, share in ((shortest, SHORT_NOISE), *((x, VELOCITY_NOISE) for x in longer)):
+    short = [(n * dt, SHORT_NOISE) for n in SHORT_KERNELS]
+    for length, share in (*short, *((x, VELOCITY_NOISE) for x in POINTWISE_KERNELS if x >= 6 * dt)):
         if length < longest and noise.after(kernel(length, dt, 1), dt) <= share * fast:
             return length
     return max(longest, 6 * dt)

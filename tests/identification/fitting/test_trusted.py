@@ -65,26 +65,6 @@ def test_an_exponent_does_not_run_off_from_a_fine_encoder(monkeypatch: pytest.Mo
     assert values["motor_stribeck_velocity"] == pytest.approx(found.parameters["M_VS"], rel=0.02)
 
 
-def test_what_a_velocity_kernel_rounds_off_is_less_than_the_error() -> None:
-    """A law of low speed fits the rounding of the reversals: a Stribeck velocity was two to three
-    of its errors too small, and a motor inertia up to four too large.
-    """
-    deviates = []
-    for seed in (73005, 73020, 73035):
-        found = simulate_case(
-            "stribeck", seed, records=("train", "train2"), overrides={"CURVE": 1.0}
-        )
-        joint = joint_of(found, ("stribeck@motor",))
-        records = [record_of(table, name, "same") for name, table in found.measured.items()]
-        model = prepared_model(joint, records[0])
-        solution = solve(model, load_dataset(records, [], joint, model))
-        for name, key in (("motor_stribeck_velocity", "M_VS"), ("motor_inertia", "JM")):
-            error = solution.stderr[name]
-            assert error is not None
-            deviates.append((solution.values[name] - found.parameters[key]) / error)
-    assert np.sqrt(np.mean(np.square(deviates))) < 1.5
-
-
 def test_a_law_that_few_reversals_show_does_not_run_off_where_noise_is_taken_off() -> None:
     """Its torque went to fifty times the truth, its velocity to a thirtieth of it."""
     found = simulate_case("stribeck", 7000, records=("train",))
