@@ -205,8 +205,8 @@ def _slow_noise_note(
         return []
     return [
         f"the reading of {READ[signal]} {' and '.join(said)}: that counts as noise, and what is "
-        "as slow and no larger is not told from it; check the amplifier, and what else pulls: another "
-        "axis, a cable"
+        "as slow and no larger is not told from it; check the amplifier, and whether another axis "
+        "pulls"
     ]
 
 
