@@ -124,8 +124,8 @@ def excitation_warnings(data: Dataset) -> tuple[str, ...]:
         limit = claim_limit(data)
         out.append(
             f"the training motion is worth {lines:.1f} lines of a spectrum, as a single sine or "
-            f"speed is: at most {limit} effects can be told "
-            "from it; add a multisine record"
+            f"speed is: at most {limit} effects of each "
+            "balance can be told from it; add a multisine record"
         )
     levels = np.histogram(np.abs(speed) / top, bins=10, range=(0, 1))[0] / max(len(speed), 1)
     if float(levels.max()) > ONE_SPEED and int(np.argmax(levels)) > 2:
@@ -334,8 +334,8 @@ def _speeds(data: Dataset) -> int:
 
 
 def claim_limit(data: Dataset) -> int:
-    """Effects that a motion of few lines can carry: two for every line, its amplitude and its
-    phase; else as many as there are.
+    """Effects of one balance that a motion of few lines can carry: two for every line, its
+    amplitude and its phase; else as many as there are.
     """
     lines = independent_lines(data)
     return int(2.0 * lines + 1e-6) if lines < FEW_LINES else len(EFFECTS)

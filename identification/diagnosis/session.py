@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -168,6 +169,11 @@ class _Standing:
         """The claims with another one in a place."""
         return tuple(claim if i == position else c for i, c in enumerate(self.claims))
 
+    def of_full(self, ranking: Ranking, limit: int) -> frozenset[str]:
+        """Labels of a balance that holds as many claims as the motion can tell there."""
+        count = Counter(c.balance for c in self.claims)
+        return frozenset(t.candidate.label for t in ranking.everything if count[t.balance] >= limit)
+
 
 @final
 @dataclass(frozen=True)
@@ -302,8 +308,10 @@ class Session:
         return replace(found, decided=told.decided)
 
     def _decide(self, start: Step, most: int, *, lean: bool) -> _Decision:
-        """What to add to the model of a step, at most so many effects."""
-        most = min(most, claim_limit(self.data))
+        """What to add to the model of a step, at most so many effects, and of each balance no more
+        than the motion can tell: the others are equations of their own.
+        """
+        limit = claim_limit(self.data)
         standing, solution = _Standing((start,)), start.solution
         self.bench.listen(start)
         base = self.bench.base(solution)
@@ -317,7 +325,8 @@ class Session:
             if len(standing.claims) >= most:
                 break
             ranking = self._confirmed(ranking, base, standing.now)
-            best = ranking.best(self._out(ranking, aside))
+            out = self._out(ranking, aside) | standing.of_full(ranking, limit)
+            best = ranking.best(out)
             may_move = not late and not self.data.sensing.one_sided
             over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
             if best is None:
@@ -331,7 +340,8 @@ class Session:
             if best is None and may_move and over:
                 late = True
                 ranking = self.bench.ranking(base, late=True)
-                best = ranking.best(self._out(ranking, aside))
+                out = self._out(ranking, aside) | standing.of_full(ranking, limit)
+                best = ranking.best(out)
             if best is None:
                 cleared = self._without_wrong(standing, decided=lean)
                 if cleared is None:
@@ -341,10 +351,8 @@ class Session:
                 ranking = self.bench.ranking(base)
                 continue
             names = confusion_set(best, ranking.everything, base)
-            best = simplest(best, names, ranking, self._out(ranking, aside))
-            best, names = self._by_whole_fit(
-                best, names, ranking, standing.now, self._out(ranking, aside)
-            )
+            best = simplest(best, names, ranking, out)
+            best, names = self._by_whole_fit(best, names, ranking, standing.now, out)
             claim = make_claim(best, ranking, base, shortened(names, ranking))
             label = best.candidate.label
             self._near[label] = _behind(best, ranking)
@@ -394,8 +402,11 @@ class Session:
                 ranking = self.bench.ranking(base, progress=self._within(0.2 + 0.6 * share, 0.0))
         if len(standing.claims) >= most:
             standing = self._without_wrong(standing, decided=lean) or standing
-        full = len(standing.claims) >= most and not stale
-        left = ranking.best(frozenset(self._refused)) if full else None
+        left = None
+        if len(standing.claims) >= most and not stale:
+            left = ranking.best(frozenset(self._refused))
+        elif standing.of_full(ranking, limit) and not stale:
+            left = ranking.best(self._out(ranking, aside))
         stopped = None
         if left is not None:
             title = left.candidate.effect.title

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,7 @@ from identification.diagnosis.session import (
     with_held_out,
 )
 from identification.errors import InputError
+from tests.recorded_world.world import make_case, write_case
 from tests.smooth_laws import (
     COULOMB,
     INERTIA,
@@ -30,6 +32,7 @@ from tests.smooth_laws import (
     nothing,
     record,
 )
+from workbench.cli.main import improve_json
 
 FloatArray = npt.NDArray[np.float64]
 JOINT = Joint(model_name="hd1", effects=("viscous", "coulomb"))
@@ -59,6 +62,34 @@ def runs(law: Law) -> tuple[Record, Record]:
 def improved(law: Law, most: int = MAX_ADDITIONS) -> Improvement:
     train, held = runs(law)
     return improve(train, JOINT, [held], max_additions=most)
+
+
+def test_a_motion_of_few_lines_limits_the_effects_of_each_balance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of one balance no more than it can tell, however many are asked for; and that is said."""
+    monkeypatch.setattr("identification.diagnosis.session.claim_limit", lambda _: 1)
+    train, held = runs(both)
+    found = improve(train, JOINT, [held])
+    assert found.claims[0].effects == improved(both, 1).claims[0].effects
+    assert len(found.claims) == 1
+    assert "Stopped at the limit of additions (1)" in found.reason
+    assert "would be the next" in found.reason
+
+
+@pytest.mark.slow
+def test_each_balance_has_a_limit_of_its_own(tmp_path: Path) -> None:
+    """Constant speeds, a line and a half, and three effects in three balances: one of motor, link
+    and transmission each.
+    """
+    write_case(make_case(310004, kind="triple", size=1.0), tmp_path, "all")
+    train, held = ([tmp_path / f"{name}.csv"] for name in ("train", "test"))
+    found = improve_json(train, held, tmp_path / "joint.toml")
+    assert [c["balance"] for c in found["claims"]] == ["motor", "link", "transmission"]
+    names = [{e.partition("@")[0] for e in c["effects"]} for c in found["claims"]]
+    hidden = ("channel_delay", "asymmetric_viscous", "backlash")
+    assert all(n in held for n, held in zip(hidden, names, strict=True))
+    assert found["verdict"] == "complete"
 
 
 def little_drag(q: FloatArray, v: FloatArray) -> FloatArray:
