@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import os
 import shutil
 import tempfile
+import threading
 import weakref
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -138,6 +141,25 @@ class Block:
     setter: Any
 
 
+_one_at_a_time = threading.Lock()
+
+
+@contextlib.contextmanager
+def _loading() -> Iterator[None]:
+    """The working directory as it was, after a library is loaded in its own folder.
+
+    fmpy goes there and back: it stays there where the library cannot be loaded, and one of two
+    threads takes the folder of the other for the one to go back to. A temporary folder is removed
+    later, and a process without a working directory opens no file by a relative path.
+    """
+    with _one_at_a_time:
+        here = os.getcwd()
+        try:
+            yield
+        finally:
+            os.chdir(here)
+
+
 @final
 class Instance:
     """One instance of an FMU, made once and reset for each run.
@@ -176,12 +198,13 @@ class Instance:
         self._used = False
         self._open = False
         try:
-            self.raw: Any = (FMU2Slave if kind == "cs" else FMU2Model)(
-                guid=fmu.description.guid,
-                unzipDirectory=str(fmu.folder),
-                modelIdentifier=part.modelIdentifier,
-                instanceName=name,
-            )
+            with _loading():
+                self.raw: Any = (FMU2Slave if kind == "cs" else FMU2Model)(
+                    guid=fmu.description.guid,
+                    unzipDirectory=str(fmu.folder),
+                    modelIdentifier=part.modelIdentifier,
+                    instanceName=name,
+                )
         except Exception as error:
             raise FmuError(
                 f"{name} ({fmu.path.name}): its library cannot be loaded here, {error}"

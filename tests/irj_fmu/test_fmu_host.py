@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import gc
+import os
 import tempfile
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
+import fmpy.fmi1
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -32,6 +37,47 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fmu]:
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fmu]:
     with Fmu(pack(tmp_path_factory.mktemp("toy")).path) as fmu:
         yield fmu
+
+
+def test_threads_that_load_libraries_leave_the_working_directory(
+    plant: Fmu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """fmpy loads a library from its own folder: of two threads one took that of the other for the
+    folder to go back to, and the process was left in one that is removed.
+    """
+    loader = fmpy.fmi1.cdll
+
+    class Slow:
+        @staticmethod
+        def LoadLibrary(path: str) -> Any:  # noqa: N802
+            time.sleep(0.02)
+            return loader.LoadLibrary(path)
+
+    monkeypatch.setattr(fmpy.fmi1, "cdll", Slow)
+    here = os.getcwd()
+
+    def load(number: int) -> None:
+        time.sleep(0.005 * number)
+        Instance(plant, "me").close()
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(load, range(4)))
+    assert os.getcwd() == here
+
+
+def test_a_library_that_cannot_be_loaded_leaves_the_working_directory(
+    plant: Fmu, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Refuses:
+        @staticmethod
+        def LoadLibrary(path: str) -> Any:  # noqa: N802
+            raise OSError(f"{path}: file too short")
+
+    monkeypatch.setattr(fmpy.fmi1, "cdll", Refuses)
+    here = os.getcwd()
+    with pytest.raises(FmuError, match="cannot be loaded here"):
+        Instance(plant)
+    assert os.getcwd() == here
 
 
 def tables(samples: FloatArray, step: float) -> dict[str, Table]:
