@@ -64,25 +64,6 @@ class Draw:
     calm: WeakRecord
     noisy: WeakRecord
 
-    @property
-    def mirrored(self) -> WeakRecord:
-        """The calm one with the same noise taken off it."""
-
-        def back(
-            calm: Mapping[str, FloatArray], noisy: Mapping[str, FloatArray]
-        ) -> dict[str, FloatArray]:
-            return {n: x if noisy[n] is x else 2 * x - noisy[n] for n, x in calm.items()}
-
-        calm, noisy = self.calm, self.noisy
-        return replace(
-            calm,
-            averaged=back(calm.averaged, noisy.averaged),
-            points=back(calm.points, noisy.points),
-            smooth=back(calm.smooth, noisy.smooth),
-            paired=back(calm.paired, noisy.paired),
-            curved=back(calm.curved, noisy.curved),
-        )
-
 
 def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Draw, ...]:
     """Draws of the noise on the channels of a record, kept for the records that asked last.

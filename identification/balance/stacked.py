@@ -247,30 +247,6 @@ def _drawn_floors(
     }
 
 
-def bent_by_noise(
-    balances: Balances, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
-) -> dict[str, FloatArray]:
-    """How far noise of the signals moves each row one way, whatever its sign, because a law bends
-    there, (rows,) [N.m]: a kink under noise is a bow, and no bow is told from it.
-    """
-    noise = {c: n.without_drift for c, n in data.sources.items()}
-    bare = balances_of(balances.model, data.sensing, wrt=())
-    settled_values = settled(balances.model, data.sensing, records, values)
-    out: dict[str, list[FloatArray]] = {b: [] for b in bare.balances}
-    for w in records:
-        own, drawn = values_on(balances.model, w, settled_values), draws_of(w, noise)
-        calm = bare.evaluate(drawn[0].calm, own, remembered=drawn[0].record)
-        moved = {b: np.zeros(w.rows) for b in out}
-        for draw in drawn:
-            there, back = (bare.evaluate(x, own) for x in (draw.noisy, draw.mirrored))
-            for b, rows in moved.items():
-                bow = (there[b][0] + back[b][0]) / 2 - calm[b][0]
-                rows[draw.rows] += bow / len(drawn)
-        for b, rows in moved.items():
-            out[b].append(np.abs(rows))
-    return {b: np.concatenate(rows) if rows else np.empty(0) for b, rows in out.items()}
-
-
 def drift_rows(
     model: JointModel, data: Dataset, values: Mapping[str, float], records: Sequence[WeakRecord]
 ) -> dict[str, FloatArray]:

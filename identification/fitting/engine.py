@@ -98,9 +98,6 @@ class Solution:
         Of all that have a standard error, nuisances and what belongs to one run left out.
     noise_off : bool
         Whether what noise adds to the products of the columns was taken off them.
-    moved : mapping of str to (float, float)
-        Where the rows' least squares had put the parameters that taking noise off then moved, and
-        where to.
     """
 
     model: JointModel
@@ -115,15 +112,6 @@ class Solution:
     iterations: int = 0
     together: Correlation = Correlation()
     noise_off: bool = False
-    moved: Mapping[str, tuple[float, float]] = field(default_factory=dict, compare=False)
-
-    @property
-    def at_least_squares(self) -> Solution:
-        """The same fit where its rows leave the least: noise taken off moves a fit away from there,
-        further in one model than in another, and by their rows they are held against each other.
-        """
-        back = {n: x for n, (x, kept) in self.moved.items() if self.values[n] == kept}
-        return replace(self, values={**self.values, **back}) if back else self
 
     @property
     def law(self) -> Law:
@@ -289,11 +277,9 @@ def _fitted(
     before = _beside(known_before, share)
     problem = WeakForm(balances, data, values, tuple(free), weights, before)
     without = unbiased(problem, limits, share)
-    without = replace(without, values=problem.physical(without.values, limits))
-    moved = {n: (x, without.values[n]) for n, x in values.items() if without.values[n] != x}
     problem = replace(problem, values=without.values)
     found = _with_errors(problem, limits, sigma, used, without=without, share=share)
-    return replace(found, unidentified=(*found.unidentified, *unseen), moved=moved)
+    return replace(found, unidentified=(*found.unidentified, *unseen))
 
 
 def carried_over(solution: Solution, data: Dataset) -> dict[str, float]:

@@ -198,95 +198,20 @@ class WeakForm:
     ) -> tuple[dict[str, float], int]:
         """Values at the minimum inside the limits, and the steps it took.
 
-        What is missing of the stiffness over a range is no more than there is: with more, the
-        joint would push itself over the gap, and a gap that is too narrow does the work of one
-        that is wider. So it moves as a share of the stiffness.
-
         Parameters
         ----------
         limits : mapping of str to (low, high)
         iterations : int
             At most so many.
         """
-        shares = _Shares.of(self, limits)
-        low, high = (np.array([limits[n][i] for n in self.free]) for i in (0, 1))
-        low[list(shares.parts)], high[list(shares.parts)] = 0.0, 1.0
+        start = [self.values[n] for n in self.free]
+        low, high = [limits[n][0] for n in self.free], [limits[n][1] for n in self.free]
         found = least_squares(
-            shares if shares.parts else self,
-            shares.into(np.array([self.values[n] for n in self.free])),
+            self,
+            start,
             (low, high),
             logarithmic=self.logarithmic,
             iterations=iterations,
             tolerance=ENOUGH,
         )
-        return self.at(shares.out(found.x)), found.iterations
-
-    def physical(
-        self, values: Mapping[str, float], limits: Mapping[str, tuple[float, float]]
-    ) -> dict[str, float]:
-        """Values with no more missing of the stiffness than there is."""
-        shares = _Shares.of(self, limits)
-        x = np.array([values[n] for n in self.free])
-        kept = shares.out(shares.into(x))
-        return {**values, **{self.free[i]: float(kept[i]) for i in shares.parts}}
-
-
-@final
-@dataclass(frozen=True)
-class _Shares:
-    """A problem in which what is missing of the stiffness over a range is a share of it; a
-    :class:`identification.fitting.least_squares.Problem`.
-
-    Attributes
-    ----------
-    form : WeakForm
-    parts : tuple of int
-        Places of what is missing among the free parameters.
-    whole : int
-        Place of the stiffness; -1 where it does not move, or nothing is missing.
-    """
-
-    form: WeakForm
-    parts: tuple[int, ...]
-    whole: int
-
-    @classmethod
-    def of(cls, form: WeakForm, limits: Mapping[str, tuple[float, float]]) -> _Shares:
-        """With all that is missing and not bounded more narrowly by what is known."""
-        model = form.balances.model
-        physical = {p.name: (p.low, p.high) for p in model.parameters}
-        parts = tuple(
-            form.free.index(n)
-            for n in model.named("softening")
-            if n in form.free and limits[n] == physical[n]
-        )
-        whole = str(model.stiffness_name)
-        if not parts or whole not in form.free:
-            return cls(form, (), -1)
-        return cls(form, parts, form.free.index(whole))
-
-    def into(self, x: FloatArray) -> FloatArray:
-        """Shares in place of the parts, (free,)."""
-        out = x.copy()
-        for i in self.parts:
-            out[i] = min(x[i] / x[self.whole], 1.0) if x[self.whole] > 0 else 1.0
-        return out
-
-    def out(self, x: FloatArray) -> FloatArray:
-        """The parts themselves, (free,)."""
-        out = x.copy()
-        for i in self.parts:
-            out[i] = x[i] * x[self.whole]
-        return out
-
-    def residual(self, x: FloatArray) -> FloatArray:
-        """As that of the form."""
-        return self.form.residual(self.out(x))
-
-    def jacobian(self, x: FloatArray) -> FloatArray:
-        """As that of the form, by the shares, (rows, free)."""
-        out = self.form.jacobian(self.out(x))
-        for i in self.parts:
-            out[:, self.whole] += x[i] * out[:, i]
-            out[:, i] *= x[self.whole]
-        return out
+        return self.at(found.x), found.iterations

@@ -19,11 +19,9 @@ from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
     INDEPENDENT_SHARE,
     LEAST_DEVIATION,
-    SCALED,
     TURN_WIDTHS,
     apart_from_drift,
     beginnings,
-    bent_by_noise,
     drawn_floors,
     drift_memory,
     innovations,
@@ -51,9 +49,6 @@ CONTRADICTED: Final = 0.9
 """Share of what the surest rival leaves of its level of noise under which what another one leaves
 contradicts its own: rows and noise are the same for all, so that levels that read too high do so
 alike, but for the tenth to which they hold."""
-ONE_UNIT: Final = 1e-3
-"""Relative difference of the scales of the measured torques under which two rivals leave residuals
-of one unit: over a few thousand rows it is worth no more than a nat."""
 DECIDED: Final = 2.0
 """Normal deviate over blocks of a difference of log-likelihoods from which a name is behind."""
 
@@ -158,8 +153,7 @@ def _common(like: Solution, start: Solution) -> dict[str, float]:
 
 @final
 class Contest:
-    """Rivals on one weighting of the rows, and what the old records say about each, where the rows
-    of each leave the least.
+    """Rivals on one weighting of the rows, and what the old records say about each.
 
     Parameters
     ----------
@@ -170,29 +164,24 @@ class Contest:
 
     def __init__(self, rivals: Sequence[Rival], data: Dataset) -> None:
         self.rivals, self.data = tuple(rivals), data
-        at_least = [replace(r, solution=r.solution.at_least_squares) for r in self.rivals]
         names = self.data.sensing.balances
-        entitled, sizes = _entitled(at_least, data)
+        entitled = _entitled(self.rivals, data)
         self._taking = {b: taking_part(b, data.train) for b in names}
         self._drift = _drift(self.rivals, data)
         left = [
             {b: self._apart(b, r, entitled[k][b]) for b, r in _left(rival, data).items()}
-            for k, rival in enumerate(at_least)
+            for k, rival in enumerate(self.rivals)
         ]
         unlikely = [_unlikely(rival, data) for rival in self.rivals]
         known = [x / INDEPENDENT_SHARE for x in unlikely]
-        costs = [
-            _cost(r, size, self._taking) + x for r, size, x in zip(left, sizes, known, strict=True)
-        ]
+        costs = [_cost(r, self._taking) + x for r, x in zip(left, known, strict=True)]
         best = int(np.argmin(costs))
         for k, rival in enumerate(self.rivals):  # none may be ahead where the two are compared
             counted = dict(zip(names, self._calm(self.rivals[best], rival), strict=True))
-            here, there = (_cost(left[i], sizes[i], counted) + known[i] for i in (k, best))
-            if here < there:
+            if _cost(left[k], counted) + known[k] < _cost(left[best], counted) + known[best]:
                 best = k
         self.leader = self.rivals[best]
         self._unlikely = np.array(unlikely)
-        self._sizes = [np.concatenate([size[b] for b in names]) for size in sizes]
         own = entitled[best]
         self._old = [
             self._rows(
@@ -200,7 +189,7 @@ class Contest:
                 data,
                 {b: w * weight[b] / own[b] for b, w in self.leader.solution.weights.items()},
             )
-            for rival, weight in zip(at_least, entitled, strict=True)
+            for rival, weight in zip(self.rivals, entitled, strict=True)
         ]
 
     def _calm(self, best: Rival, other: Rival) -> list[npt.NDArray[np.bool_]]:
@@ -250,11 +239,8 @@ class Contest:
     def likelihood(self) -> FloatArray:
         """Log-likelihood of each rival on the old records, beside what its clocks and zeros are
         worth beforehand, (rivals,) [nats]."""
-        rows = [
-            -INDEPENDENT_SHARE * (0.5 * float(r @ r) + float(size[block >= 0].sum()))
-            for (r, _, block), size in zip(self._old, self._sizes, strict=True)
-        ]
-        return np.asarray(np.array(rows) - self._unlikely)
+        rows = np.array([-0.5 * INDEPENDENT_SHARE * float(r @ r) for r, _, _ in self._old])
+        return np.asarray(rows - self._unlikely)
 
     @cached_property
     def ahead(self) -> FloatArray:
@@ -268,8 +254,7 @@ class Contest:
         out = np.zeros((len(self.rivals), 2))
         for k, (rival, (own, _, _)) in enumerate(zip(self.rivals, self._old, strict=True)):
             counted = np.concatenate(self._calm(self.leader, rival))
-            apart = _by_block((own**2 - best**2) * counted, block)
-            apart += 2 * _by_block((self._sizes[k] - self._sizes[leader]) * counted, block)
+            apart = _by_block(own * counted, block) - _by_block(best * counted, block)
             difference = 0.5 * INDEPENDENT_SHARE * apart
             count = len(difference)
             spread = float(np.std(difference, ddof=1)) * math.sqrt(count) if count > 1 else 0.0
@@ -354,48 +339,36 @@ def turning(
     return np.concatenate(parts)
 
 
-def _entitled(
-    rivals: Sequence[Rival], data: Dataset
-) -> tuple[list[dict[str, FloatArray]], list[dict[str, FloatArray]]]:
-    """One over the scatter that each row of a rival may have, per balance; and the logarithm of
-    what noise gives it, where the rivals have one unit there.
+def _entitled(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
+    """One over the scatter that each row of a rival may have, per balance.
 
     A law that scales a measured torque passes its noise on with that scale: the residuals of two
-    rivals are no lengths in one unit, and the one with the smaller unit is not the better one. A
-    law that is steeper passes on more noise of the positions, in one unit: its likelihood has the
-    price of the wider scatter. What even the best of them leaves beside noise is the same torque
-    for all: what is more than noise may be, whose squares are known to
-    :data:`~identification.balance.colour.LEVEL_ERROR`. Rows that may go either way by a law say
-    little against it, and as much as others against one that says which way; so do rows in which
-    noise of the signals bends a law. What was before a record began is known to no law: rows that
-    hang on it by one count less for all.
+    rivals are no lengths in one unit, and the one with the smaller unit is not the better one. What
+    even the best of them leaves beside noise is the same torque for all: what is more than noise
+    may be, whose squares are known to :data:`~identification.balance.colour.LEVEL_ERROR`. Rows that
+    may go either way by a law say little against it, and as much as others against one that says
+    which way. What was before a record began is known to no law: rows that hang on it by one count
+    less for all.
     """
     levels = _believable(rivals, data)
     laws = [
         (balances_of(r.solution.model, data.sensing, wrt=()), r.solution.values) for r in rivals
     ]
     either = [unsure(law, data, values, data.train) for law, values in laws]
-    bent = [bent_by_noise(law, data, values, data.train) for law, values in laws]
     begun = [beginnings(law, data, values, data.train) for law, values in laws]
-    slopes = [law.slopes(values) for law, values in laws]
     support = support_of(data.train)
     out: list[dict[str, FloatArray]] = [{} for _ in rivals]
-    sizes: list[dict[str, FloatArray]] = [{} for _ in rivals]
     for b in data.sensing.balances:
         rows = taking_part(b, data.train)
         beside = min(
             max(0.0, r.solution.sigma[b] ** 2 - (1 + LEVEL_ERROR) * rms(level[b][rows]) ** 2)
             for r, level in zip(rivals, levels, strict=True)
         )
-        first = np.max([one[b] for one in begun], axis=0) ** 2
-        units = np.array([[x[b].get(c, 0.0) for c in SCALED] for x in slopes])
-        one_unit = np.allclose(units, units[0], rtol=ONE_UNIT)
-        for k, level in enumerate(levels):
-            noise = level[b] ** 2 + beside
-            sizes[k][b] = one_unit * 0.5 * np.log(np.maximum(noise, LEAST_DEVIATION**2))
-            variance = noise + first + either[k][b] ** 2 + bent[k][b] ** 2
-            out[k][b] = support / np.sqrt(np.maximum(variance, LEAST_DEVIATION**2))
-    return out, sizes
+        beside = beside + np.max([one[b] for one in begun], axis=0) ** 2
+        for weight, level, way in zip(out, levels, either, strict=True):
+            variance = level[b] ** 2 + beside + way[b] ** 2
+            weight[b] = support / np.sqrt(np.maximum(variance, LEAST_DEVIATION**2))
+    return out
 
 
 def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatArray]]:
@@ -449,15 +422,12 @@ def _unlikely(rival: Rival, data: Dataset) -> float:
 
 
 def _cost(
-    weighted: Mapping[str, FloatArray],
-    sizes: Mapping[str, FloatArray],
-    counted: Mapping[str, npt.NDArray[np.bool_]],
+    weighted: Mapping[str, FloatArray], counted: Mapping[str, npt.NDArray[np.bool_]]
 ) -> float:
     """Log-likelihood of the counted rows of the balances but for its sign, each balance with a
     scatter of its own."""
     return sum(
         np.count_nonzero(counted[b]) * math.log(max(float(np.linalg.norm(r[counted[b]])), 1e-300))
-        + float(np.sum(sizes[b][counted[b]]))
         for b, r in weighted.items()
     )
 
@@ -473,6 +443,6 @@ def _signed_ranks(values: FloatArray) -> float:
     return float(np.sign(values) @ ranks) / max(spread, 1.0)
 
 
-def _by_block(values: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:
+def _by_block(residual: FloatArray, block: npt.NDArray[np.int64]) -> FloatArray:
     used = block >= 0
-    return np.bincount(block[used], weights=values[used]).astype(np.float64)
+    return np.bincount(block[used], weights=residual[used] ** 2).astype(np.float64)
