@@ -169,10 +169,15 @@ class _Standing:
         """The claims with another one in a place."""
         return tuple(claim if i == position else c for i, c in enumerate(self.claims))
 
-    def of_full(self, ranking: Ranking, limit: int) -> frozenset[str]:
-        """Labels of a balance that holds as many claims as the motion can tell there."""
+    def full(self, limit: int) -> frozenset[str]:
+        """Balances that hold as many claims as the motion can tell there."""
         count = Counter(c.balance for c in self.claims)
-        return frozenset(t.candidate.label for t in ranking.everything if count[t.balance] >= limit)
+        return frozenset(b for b, n in count.items() if n >= limit)
+
+    def of_full(self, ranking: Ranking, limit: int) -> frozenset[str]:
+        """Labels of what would act in such a balance."""
+        full = self.full(limit)
+        return frozenset(t.candidate.label for t in ranking.everything if t.balance in full)
 
 
 @final
@@ -330,7 +335,7 @@ class Session:
             may_move = not late and not self.data.sensing.one_sided
             over = max(e.ratio for e in standing.now.held_out.balances.values()) > RATIO_LIMIT
             if best is None:
-                slower = self._at_slower(standing)
+                slower = self._at_slower(standing, limit)
                 if slower is not None:
                     standing = slower
                     decided.append(slower.claims[-1])
@@ -405,7 +410,7 @@ class Session:
         left = None
         if len(standing.claims) >= most and not stale:
             left = ranking.best(frozenset(self._refused))
-        elif standing.of_full(ranking, limit) and not stale:
+        elif standing.full(limit) and not stale:
             left = ranking.best(self._out(ranking, aside))
         stopped = None
         if left is not None:
@@ -757,8 +762,9 @@ class Session:
         kept_others = (k for k in dict.fromkeys(others) if k in kept and k != found.key)
         return found, (found.key, *kept_others)
 
-    def _at_slower(self, standing: _Standing) -> _Standing | None:
-        """The steps with a name that only rows of a longer kernel show; None where there is none.
+    def _at_slower(self, standing: _Standing, limit: int) -> _Standing | None:
+        """The steps with a name that only rows of a longer kernel show; None where there is none,
+        or its balance holds as many as the limit.
 
         Asked once of a model, where nothing else is left to claim, and of the balances that stand
         over their floor there alone: what short rows show their noise does not hide. A set is asked
@@ -788,7 +794,7 @@ class Session:
             found = Session(bench, refused=self._refused, longer=True).diagnose(slow)
             if (
                 not found.claims
-                or found.claims[0].balance not in over
+                or found.claims[0].balance not in over - standing.full(limit)
                 or len(found.claims[0].effects) > LARGEST_SET
                 # a whole fit has no linear form to allow for, and these are further looks
                 or found.claims[0].held_out_drop_percent < MAJOR_DROP
