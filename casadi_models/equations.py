@@ -61,6 +61,8 @@ class Structure(Protocol):
     @property
     def parameter_names(self) -> tuple[str, ...]: ...
     def swinging_inertia(self, values: Mapping[str, Any]) -> Any: ...
+    def load_compliance(self, values: Mapping[str, Any]) -> Any: ...
+    def load_relaxation(self, values: Mapping[str, Any]) -> Any: ...
 
 
 @final
@@ -408,7 +410,7 @@ def build_equations(model: Structure, symbols: Symbols, *, sensors: bool) -> Equ
         passed_on = (
             drive - (sum(inertia.values()) - swinging) * s.motor_acceleration - motor_resistance
         )
-        twisted = symbols.parameters["load_compliance"] * passed_on
+        twisted = model.load_compliance(symbols.parameters) * passed_on
         lag = swinging * twisted
         beyond = replace(view, signals=s.with_values(link_position=s.link_position - twisted))
     return Equations(

@@ -35,6 +35,7 @@ from .term import (
     CALIBRATION,
     INERTIAS,
     LOAD_COMPLIANCE,
+    LOAD_DAMPING,
     SIDE_INERTIAS,
     SWINGING_SHARE,
     TOTAL_INERTIA,
@@ -306,6 +307,14 @@ class JointModel:
         """
         return values[LOAD_COMPLIANCE.name] if self.lagging_load else 0.0
 
+    def load_relaxation(self, values: Mapping[str, Any]) -> Any:
+        """Time in which the damping beside that compliance lets its twist follow the torque [s],
+        from numbers or symbols; 0 where there is none.
+        """
+        if not self.lagging_load:
+            return 0.0
+        return values[LOAD_COMPLIANCE.name] * values[LOAD_DAMPING.name]
+
     @cached_property
     def _places(self) -> Mapping[str, str]:
         """Place of each parameter; that of a smoothing velocity is its side, the joint's own
@@ -367,6 +376,7 @@ class JointModel:
             found[LOAD_COMPLIANCE.name] = LOAD_COMPLIANCE
             if "link_inertia" not in self.inertias:
                 found[SWINGING_SHARE.name] = SWINGING_SHARE
+            found[LOAD_DAMPING.name] = LOAD_DAMPING
         found.update({n: CALIBRATION[n].parameter for n in self.calibration if n in CALIBRATION})
         for term in self.terms:
             found.update({p.name: p for p in term.parameters})

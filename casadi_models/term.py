@@ -74,7 +74,16 @@ SWINGING_SHARE: Final = Parameter(
     meaning="share of the inertia that hangs on that compliance",
     side="link",
 )
-HANGING: Final = (LOAD_COMPLIANCE.name, SWINGING_SHARE.name)
+LOAD_DAMPING: Final = Parameter(
+    "load_damping",
+    "N.m.s/rad",
+    start=0.0,
+    low=0.0,
+    high=math.inf,
+    meaning="damping beside that compliance",
+    side="link",
+)
+HANGING: Final = (LOAD_COMPLIANCE.name, SWINGING_SHARE.name, LOAD_DAMPING.name)
 """Parameters of a link that is not recorded."""
 
 

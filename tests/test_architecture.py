@@ -164,12 +164,11 @@ def test_no_effect_key_decides_anything_outside_the_declarations() -> None:
 
 def test_no_parameter_name_or_ending_decides_anything_outside_the_declarations() -> None:
     from casadi_models import EFFECTS, Signals
-    from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
+    from casadi_models.term import HANGING, INERTIAS, smoothing
 
     own = {
         *INERTIAS,
-        LOAD_COMPLIANCE.name,
-        SWINGING_SHARE.name,
+        *HANGING,
         smoothing("motor").name,
         smoothing("link").name,
     }

@@ -17,7 +17,13 @@ from typing import Final
 from casadi_models import JointModel, Parameter
 from casadi_models.functions import INPUTS
 from casadi_models.quantities import ALIASES, BASE_NAMES, COUNTS, PREFIXED, PREFIXES, TABLE
-from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, TOTAL_INERTIA
+from casadi_models.term import (
+    INERTIAS,
+    LOAD_COMPLIANCE,
+    LOAD_DAMPING,
+    SWINGING_SHARE,
+    TOTAL_INERTIA,
+)
 from casadi_models.transmission import MODELS
 from identification.data import joint_schema
 from identification.data.channels import DECLARED, TIME
@@ -254,7 +260,12 @@ def models() -> str:
             p.meaning,
             "an axis measured on one side",
         )
-        for p in (*(INERTIAS[n] for n in TOTAL_INERTIA), LOAD_COMPLIANCE, SWINGING_SHARE)
+        for p in (
+            *(INERTIAS[n] for n in TOTAL_INERTIA),
+            LOAD_COMPLIANCE,
+            SWINGING_SHARE,
+            LOAD_DAMPING,
+        )
     ]
     columns = ("parameter", "rotary", "linear", "bounds", "start", "meaning", "models")
     return (

@@ -26,7 +26,7 @@ from ..equations import jointly_linear
 from ..parameter import Parameter
 from ..quantities import BASE_NAMES, BaseUnit, UnitError, base_unit, factors, linear_unit, named
 from ..signals import Expression, LocalSignals
-from ..term import INERTIAS, LOAD_COMPLIANCE, SWINGING_SHARE, smoothing
+from ..term import HANGING, INERTIAS, smoothing
 
 
 class LawError(ValueError):
@@ -686,7 +686,7 @@ def register(law: TypedLaw) -> Effect:
 
 def _own_names(found: Effect) -> None:
     """A parameter of a typed law must not have the name of another one in a model."""
-    taken = dict.fromkeys((*INERTIAS, LOAD_COMPLIANCE.name, SWINGING_SHARE.name), "the joint")
+    taken = dict.fromkeys((*INERTIAS, *HANGING), "the joint")
     taken |= {smoothing(p).name: "the joint" for p in found.acts_on}
     for other in EFFECTS.values():
         if other.key != found.key:

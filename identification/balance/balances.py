@@ -110,6 +110,17 @@ def curved_expressions(model: JointModel, sensing: Sensing) -> dict[str, Express
     return {b: lag if b == "axis" else ca.SX(0) for b in sensing.balances}
 
 
+def tilted_expressions(model: JointModel, sensing: Sensing) -> dict[str, Expression]:
+    """What enters the balances by its rate [N.m.s]: a damped twist follows the torque late, and so
+    does all that a rigid link would leave.
+    """
+    if not model.lagging_load:
+        return {}
+    late = model.load_relaxation(model.symbols.parameters)
+    rigid = residual_expressions(model, sensing)
+    return {b: late * rigid[b] if b == "axis" else ca.SX(0) for b in sensing.balances}
+
+
 @final
 class _Part:
     """Expressions with their Jacobian, split into what is linear in the signals and the rest.
@@ -235,6 +246,8 @@ class Balances:
         curved = curved_expressions(model, sensing)
         self._plain = _Part(model, expressions, columns, columns_only=columns_only)
         self._curved = _Part(model, curved, columns, columns_only=columns_only) if curved else None
+        tilted = tilted_expressions(model, sensing)
+        self._tilted = _Part(model, tilted, columns, columns_only=columns_only) if tilted else None
         self._memory = Memory(model) if self._plain.remembers else None
         self._flight = Flight(model) if sensing.kinematic else None
         self._law = Law(model.structure)
@@ -288,6 +301,8 @@ class Balances:
         full = self._plain.rows(data.means(_NAMES), data.average, data, memory, p)
         if self._curved is not None:
             full += self._curved.rows(data.bends(_NAMES), data.curve, data, memory, p)
+        if self._tilted is not None:
+            full += self._tilted.rows(data.tilts(_NAMES), data.tilt, data, memory, p)
         return full
 
     def begun(self, data: WeakRecord, values: Mapping[str, float]) -> dict[str, FloatArray]:

@@ -598,22 +598,32 @@ def _either_way(
         source = f"{place}_position"
         if not level or source not in sources:
             continue
-        lag = (
-            model.swinging_inertia(values) * model.load_compliance(values)
-            if model.lagging_load
-            else 0.0
+        held = level * np.concatenate(
+            [
+                sum(abs(part) for part in friction_rows(model, values, w, place))
+                @ _either_direction(w, place, sources[source]).astype(float)
+                for w in records
+            ]
         )
-        shares = []
-        for w in records:
-            either = _either_direction(w, place, sources[source]).astype(float)
-            shares.append(w.average(either))
-            if lag:
-                shares[-1] = shares[-1] + lag * (np.abs(w.curving) @ either)
-        held = level * np.concatenate(shares)
         for b in balances:
             if b in out:
                 out[b] = np.hypot(out[b], held)
     return out
+
+
+def friction_rows(
+    model: JointModel, values: Mapping[str, float], record: WeakRecord, place: str
+) -> list[Any]:
+    """Sparse (rows, points) arrays, of which the sum is what a friction torque of 1 on one side
+    adds to the rows of a balance at each point: its average, and what a link that hangs unseen on
+    a compliance passes on late.
+    """
+    rows = [record.averaging]
+    if model.lagging_load and place == "motor":
+        lag = model.swinging_inertia(values) * model.load_compliance(values)
+        rows += [lag * record.curving] if lag else []
+    late = model.load_relaxation(values)
+    return [*rows, late * record.tilting] if late else rows
 
 
 def _between_samples(

@@ -406,6 +406,10 @@ class WeakRecord:
         """
         return np.asarray(self.curving @ values, dtype=np.float64)
 
+    def tilt(self, values: FloatArray) -> FloatArray:
+        """Rate of the kernel average of values at the points (shapes as in :meth:`average`)."""
+        return np.asarray(self.tilting @ values, dtype=np.float64)
+
     @cached_property
     def averaging(self) -> Any:
         """Sparse matrix (rows, points) of the kernel average."""
@@ -415,6 +419,11 @@ class WeakRecord:
     def curving(self) -> Any:
         """Sparse matrix (rows, points) of the second derivative of the kernel average."""
         return self._sparse(2)
+
+    @cached_property
+    def tilting(self) -> Any:
+        """Sparse matrix (rows, points) of the rate of the kernel average."""
+        return self._sparse(1)
 
     def table(self, names: tuple[str, ...]) -> FloatArray:
         """Signals at the points as rows in the order of `names`, zeros where one is not there;
@@ -429,6 +438,20 @@ class WeakRecord:
     def bends(self, names: tuple[str, ...]) -> FloatArray:
         """Second derivatives of these averages as columns, as :meth:`table`."""
         return self._table("curved", names, self.curved, self.rows, columns=True)
+
+    def tilts(self, names: tuple[str, ...]) -> FloatArray:
+        """Rates of these averages as columns, as :meth:`table`."""
+        rates: dict[str, FloatArray] = {}
+        for source, chain in POSITION_CHAINS.items():
+            if source not in self.averaged:
+                continue
+            if len(chain) == 1:
+                rates[source] = self.tilt(self.points[source])
+                continue
+            rates.update(zip(chain, (self.averaged[n] for n in chain[1:]), strict=False))
+            if chain[-2] in self.curved:  # the rate of the last one
+                rates[chain[-1]] = self.curved[chain[-2]]
+        return self._table("tilted", names, rates, self.rows, columns=True)
 
     def _table(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -240,22 +241,22 @@ def rank(
     )
 
 
-def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> Trial | None:
-    """Best trial that the training blocks support and that only its linearised held-out drop
-    keeps from being significant.
+def nearly(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:
+    """The best trials that the training blocks support and that only their linearised held-out
+    drops keep from being significant, up to the first that is.
     """
-    for t in ranking.everything:
-        if t.candidate.label in ranking.significant:
-            return None
-        if t.candidate.label in refused or t.p_value > FALSE_DISCOVERY / max(
-            len(ranking.everything), 1
-        ):
-            continue
-        if not math.isnan(t.held_out_drop_percent) and _major(
-            replace(t, held_out_drop_percent=math.nan), base
-        ):
-            return t
-    return None
+    sure = FALSE_DISCOVERY / max(len(ranking.everything), 1)
+    better = itertools.takewhile(
+        lambda t: t.candidate.label not in ranking.significant, ranking.everything
+    )
+    return [
+        t
+        for t in better
+        if t.candidate.label not in refused
+        and t.p_value <= sure
+        and not math.isnan(t.held_out_drop_percent)
+        and _major(replace(t, held_out_drop_percent=math.nan), base)
+    ][:LARGEST_SET]
 
 
 def unproved(ranking: Ranking, base: Base, refused: frozenset[str]) -> list[Trial]:

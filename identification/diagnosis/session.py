@@ -642,21 +642,21 @@ class Session:
         return fall
 
     def _confirmed(self, ranking: Ranking, base: Base, now: Step) -> Ranking:
-        """A candidate that fails on held-out records in its linear form only is judged by a
-        whole fit.
+        """Candidates that fail on held-out records in their linear form only are judged by whole
+        fits, one after the other up to the first that passes.
         """
-        trial = nearly(ranking, base, frozenset(self._refused))
-        if trial is None:
-            return ranking if ranking.significant else self._shown_elsewhere(ranking, base, now)
-        label = trial.candidate.label
-        drop = held_drop(now.held_out, self.bench.added(trial, now).held_out, trial.balance)
-        if drop < HELD_OUT_DROP:
+        for trial in nearly(ranking, base, frozenset(self._refused)):
+            label = trial.candidate.label
+            drop = held_drop(now.held_out, self.bench.added(trial, now).held_out, trial.balance)
+            if drop >= HELD_OUT_DROP:
+                break
             lowered = (
                 f"lowers the {trial.balance} balance by {drop:.2g} % on held-out records "
                 "after the whole fit"
             )
             self._doubted[label] = f"{lowered} ({HELD_OUT_DROP:g} % asked)"
-            return ranking
+        else:
+            return ranking if ranking.significant else self._shown_elsewhere(ranking, base, now)
         passed = replace(trial, held_out_drop_percent=drop)
         # what the linear form says of the others on held-out records is no more worth than what it
         # said of this one

@@ -189,8 +189,8 @@ def without_link(solution: Solution) -> tuple[str, ...]:
     )
     return (
         "the link position is not recorded: the compliance between motor and link is fitted along; "
-        f"with the motor held the link would swing at {swing:.3g} Hz; its motion leaves a rest "
-        "over the noise",
+        f"with the motor held the link would swing at {swing:.3g} Hz; its friction counts as the "
+        "motor's",
     )
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.hold import CLOCKS
-from casadi_models.term import HANGING, LOAD_COMPLIANCE
+from casadi_models.term import HANGING, LOAD_COMPLIANCE, LOAD_DAMPING
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
 from identification.balance.dataset import (
@@ -138,6 +138,11 @@ HIGHEST_SWING: Final = 4.0
 """Highest frequency of such a link in units of 1/kernel (the kernel's -3 dB point is 0.93):
 faster ones are rigid to these rows.
 """
+LARGEST_DAMPING: Final = 0.2
+"""Damping ratio of such a link above which its damper is none: rubber couplings, the softest parts
+of drives, have relative dampings of .8 to 1.2 (DIN 740), ratios of .06 to .1, gears and belts
+less. What looks like a stronger one is a late reading or a friction.
+"""
 COLLINEAR: Final = 1e4
 """Growth of a parameter's error by the others from which it is not identified: all but one part in
 1e8 of its column's power is theirs.
@@ -177,16 +182,29 @@ def solve(
     tied = {**(start or {}), LOAD_COMPLIANCE.name: 0.0}
     # what hangs on the link loads the gear, however stiff it is
     loaded = any(t.effect.needs_load for t in model.terms)
-    held = frozenset((LOAD_COMPLIANCE.name,) if loaded else HANGING)
+    held = frozenset((LOAD_COMPLIANCE.name, LOAD_DAMPING.name) if loaded else HANGING)
     rigid = _fitted(model, data, iterations, tied, progress, held)
     swinging = _swings(rigid, data)
     if swinging is None:
         return rigid
-    found = _fitted(model, data, iterations, start or {}, progress)
-    # a start far from the scale of the torques can end in no fit at all: then the rigid fit is
-    # where to begin
-    left = [_left(model, s.values, data) for s in (found, rigid)]
-    return found if left[0] < left[1] else _fitted(model, data, iterations, swinging, progress)
+
+    def fitted(start: Mapping[str, float], held: frozenset[str] = frozenset()) -> Solution:
+        found = _fitted(model, data, iterations, start, progress, held)
+        # a start far from the scale of the torques can end in no fit at all: then the rigid fit is
+        # where to begin
+        left = [_left(model, s.values, data) for s in (found, rigid)]
+        if left[0] < left[1]:
+            return found
+        return _fitted(model, data, iterations, swinging, progress, held)
+
+    found = fitted(start or {})
+    lag = model.swinging_inertia(found.values) * model.load_compliance(found.values)
+    strong = model.load_relaxation(found.values) > 2 * LARGEST_DAMPING * math.sqrt(lag)
+    # a drive that is read later than its hold explains looks like a damper
+    late = HOLD_NAME in found.at_bound and found.values[HOLD_NAME] > 0
+    if not strong and not late:
+        return found
+    return fitted({**(start or {}), LOAD_DAMPING.name: 0.0}, frozenset((LOAD_DAMPING.name,)))
 
 
 def solved_once(model: JointModel, data: Dataset, start: Mapping[str, float]) -> Solution:
@@ -214,10 +232,10 @@ def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> floa
 
 def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     """Values with a link that swings unseen, where it shows itself in the rows of a model that
-    was fitted as rigid; else None.
+    was fitted as rigid; else None. A damper alone is no swing.
     """
     model = rigid.model
-    free = [*rigid.free, *HANGING]
+    free = [*rigid.free, *(n for n in HANGING if n != LOAD_DAMPING.name)]
     free = [n for n in model.parameter_names if n in free]
     balances = balances_of(model, data.sensing, wrt=free)
     limits = bounds_of(model, data.joint.known, data)
@@ -292,7 +310,7 @@ def carried_over(solution: Solution, data: Dataset) -> dict[str, float]:
     data : Dataset
     """
     model, tied = solution.model, solution.values.get(LOAD_COMPLIANCE.name) == 0.0
-    held = frozenset(HANGING) if tied else frozenset[str]()
+    held = frozenset(n for n in HANGING if tied or n not in solution.free)
     values, free, limits, _ = posed(model, data, solution.values, held)
     balances = balances_of(model, data.sensing, wrt=bare(free))
     weights = row_weights(balances, data, values, _sigmas(model, data, values), data.train)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import Balances
-from identification.balance.stacked import TURN_SHARE, sticking_torque
+from identification.balance.stacked import TURN_SHARE, friction_rows, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -96,7 +96,8 @@ def turns_of(
     rows, columns, values_, count = [], [], [], 0
     for balance, first, record, side in parts:
         name = balances.balances[balance]
-        found = (record.averaging @ (levels[side] * _at_turns(record, side))).tocoo()
+        passed_on = sum(friction_rows(model, values, record, side))
+        found = (passed_on @ (levels[side] * _at_turns(record, side))).tocoo()
         row, column = found.coords
         weight = weights[name][first : first + record.rows] * record.taking(name)
         rows.append(balance * each + first + row)

@@ -15,7 +15,7 @@ from casadi_models import EFFECTS, LocalSignals
 from casadi_models.effect import Effect
 from casadi_models.quantities import TABLE, UnitError, base_unit, linear_unit, side_power
 from casadi_models.sides import side_factor
-from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, smoothing
+from casadi_models.term import INERTIAS, LOAD_COMPLIANCE, LOAD_DAMPING, smoothing
 from identification.data.joint_file import parse_joint
 from identification.errors import InputError
 
@@ -207,7 +207,7 @@ def test_linear_twin(rotary: str, linear: str) -> None:
 
 
 def test_every_parameter_of_a_joint_has_a_side_and_a_linear_twin_without_angles() -> None:
-    own = [*INERTIAS.values(), LOAD_COMPLIANCE, smoothing("motor")]
+    own = [*INERTIAS.values(), LOAD_COMPLIANCE, LOAD_DAMPING, smoothing("motor")]
     for p in [*own, *(p for e in EFFECTS.values() for p in e.parameters)]:
         found = base_unit(linear_unit(p.unit))
         assert found.rad == 0, p.name

@@ -48,8 +48,8 @@ def first_look(
     limits = bounds_of(model, known, data)
     shapes = {p.name for p in model.parameters if p.is_shape} - set(now.free)
     apart = {*fixed, *shapes, *model.calibration}
-    if now.values.get(LOAD_COMPLIANCE.name) == 0.0:
-        apart |= set(HANGING)
+    tied = now.values.get(LOAD_COMPLIANCE.name) == 0.0
+    apart |= {n for n in HANGING if tied or n not in now.free}
     free = [n for n in model.parameter_names if n not in apart]
     free += names_of_runs(model, data.train)
     for n in free:

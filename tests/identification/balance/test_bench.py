@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pytest
 
 from casadi_models import EFFECTS, JointModel
+from casadi_models.term import HANGING
 from identification import fit, load_joint, read
 from identification.balance.balances import balances_of
 from identification.balance.dataset import Dataset
@@ -253,6 +254,7 @@ def test_floor_is_what_noise_leaves(key: str, place: str, sensors: str) -> None:
     "name",
     [
         "load_compliance",
+        "load_damping",
         "stiffness",
         "structural_damping",
         "backlash",
@@ -266,17 +268,18 @@ def test_floor_moves_smoothly_with_every_parameter(name: str) -> None:
     """
     case = (
         case_of("backlash", "transmission", "both encoders")
-        if name != "load_compliance"
+        if name not in HANGING
         else case_of("gravity", "link", "motor side")
     )
     assert case is not None
-    if name == "load_compliance":
+    curved = name in HANGING
+    if curved:
+        hanging = {"load_compliance": 1e-5, "swinging_share": 0.6, "load_damping": 20.0}
         case = replace(
             case,
             model=replace(case.model, lagging_load=True),
-            values={**case.values, "load_compliance": 1e-5, "swinging_share": 0.6},
+            values={**case.values, **hanging},
         )
-    curved = name == "load_compliance"
     made = prepare(
         case.record.time,
         signals_of(case.record, case.joint, case.sensing),

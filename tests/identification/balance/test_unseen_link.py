@@ -27,19 +27,19 @@ MOTOR, LINK, STIFFNESS, RATIO = 4.2, 10.8, 2.2e4, 160.0
 SWING = math.sqrt(STIFFNESS / LINK) / (2 * math.pi)
 
 
-def swinging(stiffness: float) -> Record:
-    """Drive torque and motor position of two inertias on a spring, in closed form, without
-    friction or noise.
+def swinging(stiffness: float, damping: float = 0.0) -> Record:
+    """Drive torque and motor position of two inertias on a spring and a damper, in closed form,
+    without friction or noise.
     """
     t = np.arange(0.0, 20.0, 1e-3)
-    link, acceleration, snap = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+    motor, drive = np.zeros_like(t), np.zeros_like(t)
     for i, f in enumerate((0.21, 0.53, 0.97, 1.7, 2.9)):
-        w, size = 2 * math.pi * f, 0.3 / (1 + i) ** 2
-        link += size * np.sin(w * t + i)
-        acceleration -= size * w**2 * np.sin(w * t + i)
-        snap += size * w**4 * np.sin(w * t + i)
-    motor = link + LINK * acceleration / stiffness
-    drive = MOTOR * (acceleration + LINK * snap / stiffness) + LINK * acceleration
+        w = 2 * math.pi * f
+        link = 0.3 / (1 + i) ** 2 * np.exp(1j * (w * t + i))
+        torque = -LINK * w**2 * link
+        own = link + torque / (stiffness + 1j * w * damping)
+        motor += own.imag
+        drive += (torque - MOTOR * w**2 * own).imag
     return Record.from_channels(
         t, {"motor_torque": drive / RATIO, "motor_position": motor * RATIO}, name="swing"
     )
@@ -72,6 +72,29 @@ def test_the_link_is_eliminated_exactly() -> None:
     )
     assert rigid > 0.02 * torque
     assert elastic < 1e-3 * rigid
+
+
+def test_a_damped_twist_is_eliminated_exactly_and_its_damping_found() -> None:
+    damping = 60.0
+    record, joint = swinging(STIFFNESS, damping), bare_joint()
+    model = prepared_model(joint, record)
+    data = load_dataset([record], [], joint, model)
+    values = {
+        **dict.fromkeys(model.parameter_names, 0.0),
+        "inertia": MOTOR + LINK,
+        "swinging_share": LINK / (MOTOR + LINK),
+        "load_compliance": 1 / STIFFNESS,
+    }
+    balances = Balances(model, data.sensing, wrt=())
+    undamped, damped = (
+        float(np.std(balances.evaluate(data.train[0], {**values, "load_damping": d})["axis"][0]))
+        for d in (0.0, damping)
+    )
+    assert damped < 1e-2 * undamped
+    found = solve(model, data).values
+    assert found["swinging_share"] == pytest.approx(LINK / (MOTOR + LINK), rel=5e-3)
+    assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=5e-3)
+    assert found["load_damping"] == pytest.approx(damping, rel=0.01)
 
 
 def test_inertias_and_compliance_are_found_from_the_motor_side() -> None:
