@@ -116,6 +116,14 @@ class Part:
         lags = np.abs(apart) / self.memory
         return np.asarray(self.size**2 * np.exp(-lags) * (1 + (lags if self.stages > 1 else 0.0)))
 
+    def spectrum(self, frequency: FloatArray, dt: float) -> FloatArray:
+        """Power at these frequencies [Hz] over that of white noise of unit deviation, the shape of
+        `frequency`, of a noise through one low-pass or none at steps of `dt` seconds.
+        """
+        pole = math.exp(-dt / self.memory) if self.memory > 0 else 0.0
+        away = np.abs(1 - pole * np.exp(-2j * np.pi * frequency * dt)) ** 2
+        return np.asarray(self.size**2 * (1 - pole**2) / away, dtype=np.float64)
+
     def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
         """A course of this noise, shape (count,), at steps of `dt` seconds."""
         if self.memory <= 0:
@@ -254,6 +262,24 @@ def spacings_of(dt: float, *, calm: bool = False) -> list[int]:
     `calm`.
     """
     return [m for m in SPACINGS if m == 1 or m * dt <= (CALM_REACH if calm else REACH)]
+
+
+def is_slow(dt: float) -> bool:
+    """Whether a logger of that step [s] is too slow for the colour of a noise to be read from its
+    samples.
+    """
+    return len(spacings_of(dt)) < FEWEST_SPACINGS
+
+
+def filtered_parts(dt: float) -> list[Part]:
+    """Noises through one low-pass that have the fourth differences of white noise of unit deviation
+    at steps of `dt` seconds, of growing memory, up to that of a drift.
+    """
+    return [
+        Part(1.0 / math.sqrt(float(_seen(x, 1, [1])[0])), dt * x)
+        for x in MEMORIES
+        if dt * x <= SLOWEST_COLOUR
+    ]
 
 
 def coloured(

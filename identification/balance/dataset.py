@@ -141,6 +141,9 @@ class Dataset:
                 if noise.drift is None or noise.drift.size < part.size:
                     calm = noise.without_drift
                     noise = replace(calm, parts=(*calm.parts, part))
+            if told.filtered is not None:
+                kept = noise.drift
+                noise = replace(noise, parts=(told.filtered, *([kept] if kept else [])))
             if power_of(noise.hum) < power_of(told.lines):
                 calm = noise.without_hum
                 noise = replace(calm, lines=(*calm.lines, *told.lines))

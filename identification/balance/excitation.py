@@ -188,6 +188,12 @@ def readings_notes(data: Dataset, slow: Mapping[str, SlowNoise]) -> list[str]:
     for signal, told in slow.items():
         drift = max((part.size for part in told.parts), default=0.0)
         out += _slow_noise_note(data, signal, drift, told.lines)
+        if told.filtered is not None:
+            out.append(
+                f"the noise of {READ[signal]} is that of a low-pass of "
+                f"{1000 * told.filtered.memory:.2g} ms, which samples of "
+                f"{1000 * data.train[0].grid.dt:.3g} ms show only beside the model: it counts so"
+            )
     return out
 
 

@@ -34,7 +34,13 @@ from identification.balance.beside import (
     motion_of,
     rest_beside,
 )
-from identification.balance.colour import MOST_LINES, Part, lines_in
+from identification.balance.colour import (
+    LEVEL_ERROR,
+    MOST_LINES,
+    Part,
+    filtered_parts,
+    lines_in,
+)
 from identification.balance.memory import cache_of
 from identification.balance.weak import WeakRecord, differentiated_kernel
 
@@ -81,6 +87,16 @@ turn with the motion, goes through four times with changing sign and leaves next
 """
 MOST_PIECES: Final = 6
 """Of such a course over a record: a gear that warms has a quarter of its record to do it in."""
+BANDS: Final = 8
+"""Bands, of one width, in which the power of a filtered noise is held against that of the rows, up
+to the frequencies that their kernel takes off: one memory must meet all of them.
+"""
+PARTS: Final = 3
+"""Parts of the speeds, and of the places, in which what is left is compared."""
+ROWS_APART: Final = 0.4
+"""Share of the rows that counts as independent: four to a kernel overlap."""
+TOP: Final = 1.2
+"""Highest frequency of the bands in units of 1/kernel: a hundredth of the power passes there."""
 OCTAVES: Final = 5
 """Octaves from which a course of the power is told: three more than it has unknowns."""
 
@@ -88,10 +104,24 @@ OCTAVES: Final = 5
 @final
 @dataclass(frozen=True)
 class SlowNoise:
-    """Slow noise of a reading: its drift; amplitude and frequency [Hz] of the lines of a hum."""
+    """Slow noise of a reading: its drift; amplitude and frequency [Hz] of the lines of a hum; all
+    of its other noise as noise through a low-pass, where the logger is too slow to show that.
+    """
 
     parts: tuple[Part, ...]
     lines: Lines
+    filtered: Part | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Drawn:
+    """What drawn noise makes of the rest of a record, each (draws, rows): all of it, and that of
+    the positions alone.
+    """
+
+    whole: FloatArray
+    quiet: FloatArray
 
 
 def slow_noise_of(record: WeakRecord) -> dict[str, SlowNoise]:
@@ -342,7 +372,9 @@ def _together(walks: Sequence[_Walk | None]) -> _Walk | None:
 
 
 def slow_noise_of_rest(
-    records: Sequence[WeakRecord], rests: Mapping[str, Sequence[FloatArray]]
+    records: Sequence[WeakRecord],
+    rests: Mapping[str, Sequence[FloatArray]],
+    drawn: Mapping[str, Sequence[Drawn]] | None = None,
 ) -> dict[str, SlowNoise]:
     """Slow noise of the readings of torques in what a fitted model leaves, by signal.
 
@@ -361,6 +393,9 @@ def slow_noise_of_rest(
         (`both`) and of the drive's beside all motion (`drive`); those that the balances give. No
         number where a row takes no part: a walk goes on over what is left out, and what is left
         over is a walk.
+    drawn : mapping of str to sequence of Drawn, optional
+        By signal whose samples do not show the colour of its noise: what is drawn of white noise in
+        the rest of each record. What is found counts for a white noise of one.
     """
     left = {key: _beside_laws(records, key, courses) for key, courses in rests.items()}
     walks: dict[str, _Walk] = {}
@@ -387,9 +422,81 @@ def slow_noise_of_rest(
     for signal in left:
         hum = sorted((own.get(signal, ()) for own in hums), key=power_of)[(len(hums) - 1) // 2]
         parts = (_drift(drifts[signal], memory),) if signal in drifts else ()
-        if parts or hum:
-            found[signal] = SlowNoise(parts, hum)
+        filtered = None
+        if drawn is not None and signal in drawn:
+            filtered = filtered_noise(records, left[signal], drawn[signal])
+        if parts or hum or filtered:
+            found[signal] = SlowNoise(parts, hum, filtered)
     return found
+
+
+def filtered_noise(
+    records: Sequence[WeakRecord], courses: Sequence[FloatArray], drawn: Sequence[Drawn]
+) -> Part | None:
+    """The noise through a low-pass that has the fourth differences of white noise of unit deviation
+    and, in place of the white noise that is drawn, meets the spectrum of the courses in all bands;
+    None where none does, or white noise does about as well.
+
+    What a model lacks has the frequencies of the motion and what a law makes of them: none falls
+    from the lowest band to the highest as a filter does, at the power that the samples ask of it.
+    And it knows of the motion: noise is as large at one speed and place as at another.
+    """
+    dt, top = records[0].grid.dt, TOP / records[0].grid.length
+    tried = [Part(1.0), *filtered_parts(dt)]
+    number = np.zeros(BANDS)
+    power = np.zeros(BANDS)
+    foreseen = np.zeros((len(tried), BANDS))
+    for w, course, noise in zip(records, courses, drawn, strict=True):
+        rows, length = _longest(w)
+        kept = rows & np.isfinite(course)
+        count = int(kept.sum())
+        step = length / max(int(rows.sum()), 1)
+        frequency = np.arange(1, count // 2) / max(count * step, 1e-300)
+        frequency = frequency[frequency < top]
+        if not len(frequency):
+            return None
+        inside = slice(1, 1 + len(frequency))
+        band = (frequency / top * BANDS).astype(np.int64)
+
+        def of(course: FloatArray, inside: slice = inside) -> FloatArray:
+            return np.asarray(np.abs(np.fft.rfft(course, axis=-1)[..., inside]) ** 2)
+
+        own = of(_calm(course[kept]))
+        quiet = of(noise.quiet[:, kept]).mean(axis=0)
+        white = np.maximum(of(noise.whole[:, kept]).mean(axis=0) - quiet, 0.0)
+        number += np.bincount(band, minlength=BANDS)
+        power += np.bincount(band, np.log(np.maximum(own, 1e-300)) + LOG_BIAS, BANDS)
+        for k, part in enumerate(tried):
+            passed = np.bincount(band, quiet + white * part.spectrum(frequency, dt), BANDS)
+            ordinates = np.maximum(np.bincount(band, minlength=BANDS), 1)
+            foreseen[k] += ordinates * np.log(np.maximum(passed / ordinates, 1e-300))
+    use = number > 0
+    scatter = (LOG_SCATTER + 1.0 / min(len(d.whole) for d in drawn)) / number[use]
+    off = ((power - foreseen)[:, use] / number[use]) ** 2 / (scatter + LEVEL_ERROR**2)
+    left = off.sum(axis=1)
+    best = int(np.argmin(left))
+    degrees = int(use.sum()) - 1
+    met = left[best] <= degrees + ALONE * math.sqrt(2.0 * degrees)
+    if not best or not met or left[0] - left[best] < CERTAIN or _knows_motion(records, courses):
+        return None
+    return tried[best]
+
+
+def _knows_motion(records: Sequence[WeakRecord], courses: Sequence[FloatArray]) -> bool:
+    """Whether what is left is certainly larger at some speeds or places than at others."""
+    squares = np.concatenate(courses) ** 2
+    kept = np.isfinite(squares)
+    squares = squares[kept]
+    sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.averaged for w in records)]
+    for signal in (f"{sides[0]}_velocity", f"{sides[0]}_position"):
+        where = np.concatenate([w.averaged[signal] for w in records])[kept]
+        where = np.abs(where) if signal.endswith("velocity") else where
+        order = np.array_split(np.argsort(where), PARTS)
+        power = np.array([float(np.median(squares[rows])) for rows in order])
+        error = 2.0 / (ROWS_APART * len(order[0])) + LEVEL_ERROR**2
+        if math.log(power.max() / power.min()) > ALONE * math.sqrt(2.0 * error):
+            return True
+    return False
 
 
 def _with_zeros(course: FloatArray) -> FloatArray:
@@ -444,4 +551,11 @@ def power_of(lines: Lines) -> float:
     return sum(size**2 for size, _ in lines) / 2.0
 
 
-__all__ = ["SlowNoise", "power_of", "slow_noise_of", "slow_noise_of_rest"]
+__all__ = [
+    "Drawn",
+    "SlowNoise",
+    "filtered_noise",
+    "power_of",
+    "slow_noise_of",
+    "slow_noise_of_rest",
+]

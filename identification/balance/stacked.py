@@ -15,11 +15,16 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
-from identification.balance.colour import ChannelNoise
+from identification.balance.colour import ChannelNoise, is_slow, white
 from identification.balance.dataset import Dataset
-from identification.balance.drawn_noise import draws_of
+from identification.balance.drawn_noise import LONGEST, draws_of
 from identification.balance.memory import Law, numbers_of
-from identification.balance.slow_noise import SlowNoise, slow_noise_of_rest
+from identification.balance.slow_noise import (
+    Drawn,
+    SlowNoise,
+    filtered_noise,
+    slow_noise_of_rest,
+)
 from identification.balance.weak import WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -375,17 +380,74 @@ def slow_noise_beside(
         }
         for w in records
     ]
-    whole = next((b for b in ("sum", "axis") if b in balances.balances), None)
-    rests: dict[str, list[FloatArray]] = {}
-    if {"motor", "link"} <= set(balances.balances):
-        rests = {
-            "torque": [r["link"] for r in left],
-            "both": [r["motor"] for r in left],
-            "drive": [r["motor"] + r["link"] for r in left],
+    each = [_rests_of(r) for r in left]
+    rests = {key: [r[key] for r in each] for key in each[0]}
+    drawn: dict[str, list[Drawn]] = {}
+    levels = _uncoloured(data, records)
+    if levels:
+        sources = data.sources
+        quiet = {c: white(0.0) if c in SCALED else own for c, own in sources.items()}
+        whole_of, quiet_of = (
+            [_drawn_rests(balances, model, values, w, s) for w in records] for s in (sources, quiet)
+        )
+        drawn = {
+            key: [Drawn(a[key], b[key]) for a, b in zip(whole_of, quiet_of, strict=True)]
+            for key in rests
         }
-    elif whole is not None:
-        rests = {"drive": [r[whole] for r in left]}
-    return {c: x for c, x in slow_noise_of_rest(records, rests).items() if c in data.noise}
+    found = {}
+    if rests.keys() == {"both"}:
+        told = filtered_noise(records, rests["both"], drawn["both"]) if drawn else None
+        found = {c: SlowNoise((), (), told) for c in levels if told is not None}
+    elif rests:
+        found = slow_noise_of_rest(records, rests, {c: drawn[c] for c in levels if c in drawn})
+    for c, slow in found.items():
+        if slow.filtered is not None:
+            part = replace(slow.filtered, size=levels[c] * slow.filtered.size)
+            found[c] = replace(slow, filtered=part)
+    return {c: x for c, x in found.items() if c in data.noise}
+
+
+def _uncoloured(data: Dataset, records: Sequence[WeakRecord]) -> dict[str, float]:
+    """Noise levels of the measured torques whose samples are too far apart to show its colour."""
+    # of a longer record noise is drawn for pieces, which have no spectrum of the whole
+    if not is_slow(records[0].grid.dt) or max(w.rows for w in records) > LONGEST:
+        return {}
+    return {
+        c: own.level
+        for c, own in data.sources.items()
+        if c in SCALED and own.level > 0 and all(p.memory <= 0 for p in own.without_drift.parts)
+    }
+
+
+def _drawn_rests(
+    balances: Balances,
+    model: JointModel,
+    values: Mapping[str, float],
+    record: WeakRecord,
+    sources: Mapping[str, ChannelNoise],
+) -> dict[str, FloatArray]:
+    """What drawn noise makes of the rests of :func:`slow_noise_beside`, (draws, rows) each."""
+    own = values_on(model, record, values)
+    made: dict[str, list[FloatArray]] = {}
+    for draw in draws_of(record, sources):
+        noisy, calm = (balances.evaluate(w, own) for w in (draw.noisy, draw.calm))
+        rests = _rests_of({b: noisy[b][0] - calm[b][0] for b in noisy})
+        for key, rows in rests.items():
+            made.setdefault(key, []).append(rows)
+    return {key: np.stack(rows) for key, rows in made.items()}
+
+
+def _rests_of(rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """What rows of balances leave of the transmitted torque (`torque`), of the drive's beside it
+    (`both`) and of the drive's beside all motion (`drive`); those that they give.
+    """
+    if {"motor", "link"} <= set(rows):
+        together = rows["motor"] + rows["link"]
+        return {"torque": rows["link"], "both": rows["motor"], "drive": together}
+    whole = next((b for b in ("sum", "axis") if b in rows), None)
+    if whole is not None:
+        return {"drive": rows[whole]}
+    return {"both": rows["motor"]} if "motor" in rows else {}
 
 
 def drift_memory(data: Dataset) -> float:

@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 from identification import Joint, Record, fit, improve
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled, values_on
+from identification.balance.colour import Part
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.balance.noise import calm_of, noise_of
 from identification.balance.stacked import drawn_floors, slow_noise_beside
@@ -337,3 +338,49 @@ def test_a_coarse_encoder_does_not_cut_an_even_motion_to_pieces(bits: int) -> No
     weights = np.full(15, 1 / 15)
     true = np.std(np.convolve(torque, weights, "valid"))
     assert noise.after(weights, 1 / rate) == pytest.approx(true, rel=0.25)
+
+
+def logged_slowly(memory: float, missing: str = "", seed: int = 4) -> Fit:
+    """An axis at 100 Hz, with noise of that memory [s] in its torque and, maybe, a law that the
+    fitted model has not.
+    """
+    t, rng = np.arange(0.0, 60.0, 0.01), np.random.default_rng(seed)
+    pace = 2 * np.pi * np.geomspace(0.1, 2.5, 9)[:, None]
+    q, v, a = (
+        np.sum(0.3 * pace ** (k - 0.7) * np.sin(pace * t + k * np.pi / 2 + 40 * pace), axis=0)
+        for k in range(3)
+    )
+    laws = {
+        "": 0.0,
+        "cubic": 0.02 * v**3,
+        "stribeck": 0.1 * np.sign(v) * np.exp(-((v / 0.3) ** 2)),
+        "cogging": 0.05 * np.sin(40 * q),
+    }
+    noise = 0.02 * Part(1.0, memory).draw(rng, len(t), 0.01)
+    torque = 0.1 * a + 0.5 * v + 0.4 * np.tanh(v / 0.01) + laws[missing] + noise
+    position = q + 1e-6 * rng.standard_normal(len(t))
+    record = Record.from_channels(
+        t, {"motor_current": torque, "motor_position": position}, name="slow"
+    )
+    joint = Joint("axis", torque_per_current=1.0, model_name="hd1", effects=("viscous", "coulomb"))
+    return fit(joint, [record])
+
+
+@pytest.mark.parametrize("memory", [0.02, 0.04])
+def test_a_filtered_noise_that_slow_samples_do_not_show_is_seen_beside_the_model(
+    memory: float,
+) -> None:
+    found = logged_slowly(memory)
+    assert found.data.sources["drive"].parts[0].memory == 0.0
+    assert found.train.balances["axis"].ratio > 1.5
+    part = slow_noise_beside(found.model, found.data, found.solution.values)["drive"].filtered
+    assert part is not None
+    assert part.memory == pytest.approx(memory, rel=0.3)
+    assert part.size == pytest.approx(0.02, rel=0.3)
+
+
+@pytest.mark.parametrize("missing", ["", "cubic", "stribeck", "cogging"])
+def test_what_a_model_lacks_is_no_filtered_noise(missing: str) -> None:
+    found = logged_slowly(0.0, missing)
+    assert (found.train.balances["axis"].ratio > 1.5) == bool(missing)
+    assert slow_noise_beside(found.model, found.data, found.solution.values) == {}
