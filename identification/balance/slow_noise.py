@@ -42,7 +42,7 @@ from identification.balance.colour import (
     lines_in,
 )
 from identification.balance.memory import cache_of
-from identification.balance.weak import WeakRecord, differentiated_kernel
+from identification.balance.weak import INDEPENDENT_SHARE, WeakRecord, differentiated_kernel
 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
@@ -93,8 +93,6 @@ to the frequencies that their kernel takes off: one memory must meet all of them
 """
 PARTS: Final = 3
 """Parts of the speeds, and of the places, in which what is left is compared."""
-ROWS_APART: Final = 0.4
-"""Share of the rows that counts as independent: four to a kernel overlap."""
 TOP: Final = 1.2
 """Highest frequency of the bands in units of 1/kernel: a hundredth of the power passes there."""
 OCTAVES: Final = 5
@@ -493,7 +491,7 @@ def _knows_motion(records: Sequence[WeakRecord], courses: Sequence[FloatArray]) 
         where = np.abs(where) if signal.endswith("velocity") else where
         order = np.array_split(np.argsort(where), PARTS)
         power = np.array([float(np.median(squares[rows])) for rows in order])
-        error = 2.0 / (ROWS_APART * len(order[0])) + LEVEL_ERROR**2
+        error = 2.0 / (INDEPENDENT_SHARE * len(order[0])) + LEVEL_ERROR**2
         if math.log(power.max() / power.min()) > ALONE * math.sqrt(2.0 * error):
             return True
     return False

@@ -25,7 +25,7 @@ from identification.balance.slow_noise import (
     filtered_noise,
     slow_noise_of_rest,
 )
-from identification.balance.weak import WeakRecord, whole
+from identification.balance.weak import INDEPENDENT_SHARE, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -62,8 +62,6 @@ STILL_KNOWN: Final = 0.1
 MOST_OF_A_BEGINNING: Final = 0.05
 """Rows of a record, as a share, that its beginning may reach: what a twentieth leaves out lets no
 law look better by more than its rows are worth."""
-INDEPENDENT_SHARE: Final = 0.4
-"""Share of the rows that count as independent: four rows to a kernel length."""
 SURE_ERRORS: Final = 3.0
 """Standard errors by which a residual must lie under the noise level before that level counts
 as too high.
@@ -660,13 +658,12 @@ def _either_way(
         source = f"{place}_position"
         if not level or source not in sources:
             continue
-        held = level * np.concatenate(
-            [
-                sum(abs(part) for part in friction_rows(model, values, w, place))
-                @ _either_direction(w, place, sources[source]).astype(float)
-                for w in records
-            ]
-        )
+        shares = []
+        for w in records:
+            either = _either_direction(w, place, sources[source]).astype(float)
+            average, *later = friction_rows(model, values, w, place)
+            shares.append(sum((abs(part) @ either for part in later), average @ either))
+        held = level * np.concatenate(shares)
         for b in balances:
             if b in out:
                 out[b] = np.hypot(out[b], held)

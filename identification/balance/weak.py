@@ -41,6 +41,8 @@ TORQUES: Final = ("torque", "drive", "coupling_torque")
 HIGHEST_DERIVATIVE: Final = 4
 CLAIM_KERNEL: Final = 0.06
 """Length of the balances' kernel [s]."""
+INDEPENDENT_SHARE: Final = 0.4
+"""Share of the rows that count as independent: four rows to a kernel length."""
 KERNEL_SAMPLES: Final = 8
 """Samples that a kernel has at least, however slow the logger."""
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, names_of_runs, settled
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import INDEPENDENT_SHARE
+from identification.balance.weak import INDEPENDENT_SHARE
 from identification.fitting.covariance import RANK
 from identification.fitting.engine import Solution
 from identification.fitting.errors_in_variables.products import known, level_error, noise_products

@@ -16,7 +16,8 @@ from casadi_models.parameter import Parameter
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare
 from identification.balance.dataset import HOLD_NAME, Dataset
-from identification.balance.stacked import INDEPENDENT_SHARE, references
+from identification.balance.stacked import references
+from identification.balance.weak import INDEPENDENT_SHARE
 from identification.data.formats import words
 from identification.data.joint_file import Joint
 from identification.errors import InputError

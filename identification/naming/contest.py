@@ -17,7 +17,6 @@ from identification.balance.calibration import usual
 from identification.balance.colour import LEVEL_ERROR
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import (
-    INDEPENDENT_SHARE,
     LEAST_DEVIATION,
     TURN_WIDTHS,
     apart_from_drift,
@@ -33,7 +32,7 @@ from identification.balance.stacked import (
     taking_part,
     unsure,
 )
-from identification.balance.weak import REST_SHARE, RESTING_SIDES, WeakRecord
+from identification.balance.weak import INDEPENDENT_SHARE, REST_SHARE, RESTING_SIDES, WeakRecord
 from identification.diagnosis.candidates import offered, shape_grid
 from identification.diagnosis.trials import Trial, make_base, try_candidate
 from identification.fitting.engine import Solution, reweighed, solved_once, stepped

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS
 from identification.balance.balances import balances_of
 from identification.balance.dataset import load_dataset, prepared_model
-from identification.balance.stacked import INDEPENDENT_SHARE
+from identification.balance.weak import INDEPENDENT_SHARE
 from identification.data.formats import words
 from identification.data.joint_file import Joint
 from identification.data.typical import true_values

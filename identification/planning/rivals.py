@@ -13,8 +13,8 @@ import numpy.typing as npt
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import INDEPENDENT_SHARE, row_weights
-from identification.balance.weak import WeakRecord
+from identification.balance.stacked import row_weights
+from identification.balance.weak import INDEPENDENT_SHARE, WeakRecord
 from identification.fitting.covariance import RANK
 from identification.fitting.information import form_of
 from identification.naming.contest import FEWEST, Contest, Rival, about_turns, turning

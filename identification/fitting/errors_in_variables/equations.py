@@ -20,13 +20,13 @@ import numpy.typing as npt
 from identification.balance.balances import balances_of
 from identification.balance.colour import LEVEL_ERROR
 from identification.balance.stacked import (
-    INDEPENDENT_SHARE,
     SURE_ERRORS,
     drawn_floors,
     noise_believed,
     stack,
     taking_part,
 )
+from identification.balance.weak import INDEPENDENT_SHARE
 from identification.fitting.covariance import RANK
 from identification.fitting.errors_in_variables.bands import Bands
 from identification.fitting.errors_in_variables.instruments import (

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
-from identification.balance.stacked import INDEPENDENT_SHARE, Stacked, noise_believed, stack
-from identification.balance.weak import WeakRecord
+from identification.balance.stacked import Stacked, noise_believed, stack
+from identification.balance.weak import INDEPENDENT_SHARE, WeakRecord
 from identification.fitting.covariance import cores
 from identification.fitting.errors_in_variables.instruments import Instruments, from_others
 from identification.fitting.weak_form import WeakForm
