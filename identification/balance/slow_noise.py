@@ -88,13 +88,15 @@ turn with the motion, goes through four times with changing sign and leaves next
 MOST_PIECES: Final = 6
 """Of such a course over a record: a gear that warms has a quarter of its record to do it in."""
 BANDS: Final = 8
-"""Bands, of one width, in which the power of a filtered noise is held against that of the rows, up
-to the frequencies that their kernel takes off: one memory must meet all of them.
+"""Bands, of one width, in which the power of a filtered noise is held against that of the rows: one
+memory must meet all of them.
 """
 PARTS: Final = 3
 """Parts of the speeds, and of the places, in which what is left is compared."""
 TOP: Final = 1.2
-"""Highest frequency of the bands in units of 1/kernel: a hundredth of the power passes there."""
+"""Highest frequency of the bands in units of 1/kernel: the kernel passes three tenths of the power
+there; above it the noise of the positions and the clocks' shifts make the most.
+"""
 OCTAVES: Final = 5
 """Octaves from which a course of the power is told: three more than it has unknowns."""
 
