@@ -129,11 +129,10 @@ def corners_of(
     records: Sequence[WeakRecord],
     noise: Mapping[str, ChannelNoise],
     sensing: Sensing,
-    *,
-    rigid: bool,
 ) -> dict[str, Corner]:
     """What these records say together of the corners, by the side; without those sides of which
-    they say nothing.
+    they say nothing. The motor alone tells none: behind it the link swings, and what moves is no
+    single inertia.
 
     Parameters
     ----------
@@ -143,17 +142,12 @@ def corners_of(
         Of each measured signal.
     sensing : Sensing
         What is measured.
-    rigid : bool
-        Whether all that moves is one inertia where the motor alone is recorded: behind a gear the
-        link swings, and how is not known.
     """
     ways: dict[str, tuple[str, tuple[str, ...]]] = {}
     if sensing.clamped_link:
         return {}
     if sensing.has_drive and (sensing.has_torque or sensing.both_positions):
         ways["motor"] = ("drive", ("torque" if sensing.has_torque else TWIST,))
-    elif sensing.has_drive and rigid:
-        ways |= dict.fromkeys(("motor", "link"), ("drive", (GRAVITY,)))
     if sensing.has_torque and not sensing.motor_and_torque:
         coupling = ("coupling_torque",) if sensing.has_coupling else ()
         ways["link"] = ("torque", (GRAVITY, *coupling))
@@ -183,6 +177,8 @@ def with_corners(
     def make() -> tuple[WeakRecord, int]:
         found = {}
         for side, corner in corners.items():
+            if side == "link" and record.masked:  # another payload has another inertia
+                continue
             run = _run(record, side, (corner.reading, corner.against), noise)
             if run.heard(corner.beside) <= LOUDER * corner.inertia:
                 motion = run.begun
@@ -240,7 +236,7 @@ def _corner(
 ) -> Corner | None:
     """None where the records do not tell an inertia and the friction of that side."""
     runs = [_run(w, side, way, noise) for w in records]
-    speeds = np.concatenate([np.abs(r.smooth[~r.still]) for r in runs])
+    speeds = np.concatenate([np.abs(r.smooth[~r.still & (r.smooth != 0.0)]) for r in runs])
     grid = runs[0].record.grid
     few = whole(SLOWEST * grid.length / (grid.step * grid.dt))
     if len(speeds) <= few:

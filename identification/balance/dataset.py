@@ -192,7 +192,8 @@ class Dataset:
 
 def usual_kernel(sensing: Sensing, joint: Joint) -> float:
     """Length of a row where noise asks for no longer one [s]."""
-    return ONE_SIDED_KERNEL if seen_from_the_motor(sensing, joint) else CLAIM_KERNEL
+    geared = abs(joint.gear_ratio) != 1.0
+    return ONE_SIDED_KERNEL if geared and seen_from_the_motor(sensing, joint) else CLAIM_KERNEL
 
 
 FEWEST_ROWS: Final = 40
@@ -290,8 +291,7 @@ def load_dataset(
     if told is not None:
         return data.with_corners(told.corners)
     alike = [w for w, r in zip(prepared, train, strict=False) if r.payload == train[0].payload]
-    rigid = not seen_from_the_motor(sensing, joint)
-    return data.with_corners(corners_of(alike, data.sources, sensing, rigid=rigid))
+    return data.with_corners(corners_of(alike, data.sources, sensing))
 
 
 def _noise_of_all(
@@ -362,14 +362,14 @@ def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
 
 
 def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
-    """True for a geared joint of which only the drive side is recorded: the load hangs on a
-    compliance nobody measures.
+    """True for a joint with a transmission of which only the drive side is recorded: the load hangs
+    on a compliance nobody measures. A linear axis has its screw or belt, whatever its ratio says.
     """
     return (
         sensing.balances == ("axis",)
         and sensing.moving == "motor_position"
         and not sensing.both_positions
-        and abs(joint.gear_ratio) != 1.0
+        and (abs(joint.gear_ratio) != 1.0 or joint.kind == "linear")
     )
 
 

@@ -106,6 +106,29 @@ def test_inertias_and_compliance_are_found_from_the_motor_side() -> None:
     assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=0.02)
 
 
+@pytest.mark.parametrize(("kind", "seen"), [("linear", True), ("rotary", False)])
+def test_a_linear_axis_has_a_transmission_whatever_its_ratio_says(kind: str, seen: bool) -> None:
+    """A carriage behind its screw swings as a link behind its gear; a direct drive has nothing
+    between."""
+    geared = swinging(STIFFNESS)
+    record = Record.from_channels(
+        geared.time,
+        {
+            "motor_torque": geared["motor_torque"] * RATIO,
+            "motor_position": geared["motor_position"] / RATIO,
+        },
+        name="carriage",
+    )
+    joint = Joint(name="carriage", kind=kind, gear_ratio=1.0, model_name="hd1", effects=())
+    model = prepared_model(joint, record)
+    assert model.lagging_load == seen
+    found = solve(model, load_dataset([record], [], joint, model)).values
+    if seen:
+        assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-3)
+        assert found["swinging_share"] == pytest.approx(LINK / (MOTOR + LINK), rel=0.02)
+        assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=0.02)
+
+
 def test_a_rigid_joint_has_no_compliance_to_find() -> None:
     record, joint = swinging(1e12), bare_joint()
     model = prepared_model(joint, record)
