@@ -22,7 +22,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, final
+from typing import Any, Final, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
@@ -36,6 +36,8 @@ from identification.balance.weak import PAIR, REST_SHARE, WeakRecord, kernel, wh
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+_Way: TypeAlias = tuple[tuple[str, ...], tuple[str, ...]]
+"""Signals whose sum follows from a motion, and what else that follows from."""
 TWIST: Final = "twist"
 """Column of the difference of both positions."""
 GRAVITY: Final = "gravity"
@@ -84,8 +86,8 @@ class Corner:
 
     Attributes
     ----------
-    reading : str
-        What follows from the motion: what drives the side, or what it passes on.
+    reading : tuple of str
+        Signals whose sum follows from the motion: what drives the side, or what it passes on.
     against : tuple of str
         What else that follows from but inertia and friction.
     inertia : float
@@ -99,7 +101,7 @@ class Corner:
         all slower motion.
     """
 
-    reading: str
+    reading: tuple[str, ...]
     against: tuple[str, ...]
     inertia: float
     beside: tuple[float, ...]
@@ -143,17 +145,20 @@ def corners_of(
     sensing : Sensing
         What is measured.
     """
-    ways: dict[str, tuple[str, tuple[str, ...]]] = {}
+    ways: dict[str, _Way] = {}
     if sensing.clamped_link:
         return {}
-    if sensing.has_drive and (sensing.has_torque or sensing.both_positions):
-        ways["motor"] = ("drive", ("torque" if sensing.has_torque else TWIST,))
+    coupling = ("coupling_torque",) if sensing.has_coupling else ()
+    passed = ("torque", *coupling)
+    if sensing.motor_and_torque or (sensing.both_positions and sensing.has_drive):
+        ways["motor"] = (("drive",), ("torque" if sensing.has_torque else TWIST,))
     if sensing.has_torque and not sensing.motor_and_torque:
-        coupling = ("coupling_torque",) if sensing.has_coupling else ()
-        ways["link"] = ("torque", (GRAVITY, *coupling))
+        # of one position both sides have one velocity
+        sides = ("link",) if sensing.both_positions else ("motor", "link")
+        ways |= dict.fromkeys(sides, (passed, (GRAVITY,)))
     elif sensing.both_positions and sensing.has_drive:
         # a transmission gives way by a share of what it passes on
-        ways["link"] = (TWIST, (GRAVITY,))
+        ways["link"] = ((TWIST,), (GRAVITY, *coupling))
     found = {side: _corner(records, side, way, noise) for side, way in ways.items()}
     return {side: corner for side, corner in found.items() if corner is not None}
 
@@ -180,7 +185,7 @@ def with_corners(
             if side == "link" and record.masked:  # another payload has another inertia
                 continue
             run = _run(record, side, (corner.reading, corner.against), noise)
-            if run.heard(corner.beside) <= LOUDER * corner.inertia:
+            if run.told(corner):
                 motion = run.begun
                 for _ in range(ROUNDS):
                     motion = run.sticking(corner, motion)
@@ -231,7 +236,7 @@ def corner_weights(length: float, dt: float, step: int = 1) -> FloatArray:
 def _corner(
     records: Sequence[WeakRecord],
     side: str,
-    way: tuple[str, tuple[str, ...]],
+    way: _Way,
     noise: Mapping[str, ChannelNoise],
 ) -> Corner | None:
     """None where the records do not tell an inertia and the friction of that side."""
@@ -281,7 +286,7 @@ def _corner(
         beside_it, speeds_at = tuple(values[:count].tolist()), tuple(nodes.tolist())
         corner = Corner(*way, inertia, beside_it, speeds_at, (forward, backward))
         motions = [
-            r.sticking(corner, motion) if r.heard(corner.beside) <= LOUDER * inertia else motion
+            r.sticking(corner, motion) if r.told(corner) else motion
             for r, motion in zip(runs, motions, strict=True)
         ]
     return corner
@@ -301,6 +306,8 @@ class _Run:
     smooth : (points,) array
         Velocity by its kernel.
     still : (points,) bool array
+    length : float
+        Kernel of that velocity [s].
     weights : (k,) array
         Of :func:`corner_weights`.
     loud : float
@@ -317,6 +324,7 @@ class _Run:
     at_points: FloatArray
     smooth: FloatArray
     still: npt.NDArray[np.bool_]
+    length: float
     weights: FloatArray
     loud: float
     louder: tuple[tuple[int, float], ...]
@@ -326,13 +334,15 @@ class _Run:
         """Motion before any corner, as :meth:`sticking` gives it."""
         return self.smooth, np.asarray(self.smooth > 0, dtype=np.float64)
 
-    def heard(self, beside: Sequence[float]) -> float:
-        """Noise that the torques give the velocity, in units of the encoder's in it, for an
-        inertia of 1.
+    def told(self, corner: Corner) -> bool:
+        """Whether the torques are quiet enough to tell corners, and friction is known down to the
+        speeds that the kernel sees at a turn, or changes nothing there.
         """
-        parts = (own * (1.0 if i < 0 else beside[i]) for i, own in self.louder)
-        heard = math.hypot(*parts)
-        return heard / self.loud if self.loud > 0 else (math.inf if heard > 0 else 0.0)
+        parts = (own * (1.0 if i < 0 else corner.beside[i]) for i, own in self.louder)
+        step = max(corner.friction[0][0] - corner.friction[1][0], 0.0)
+        known = corner.nodes[0] <= step * self.length
+        nothing = step * float(np.abs(np.cumsum(self.weights)).max()) <= self.loud
+        return math.hypot(*parts) <= LOUDER * self.loud * corner.inertia and (known or nothing)
 
     def sticking(
         self, corner: Corner, motion: tuple[FloatArray, FloatArray]
@@ -374,13 +384,13 @@ class _Run:
 def _run(
     record: WeakRecord,
     side: str,
-    way: tuple[str, tuple[str, ...]],
+    way: _Way,
     noise: Mapping[str, ChannelNoise],
 ) -> _Run:
     source, grid = f"{side}_position", record.grid
-    (reading,), beside = _columns(record, side, way[0]), []
-    for name in way[1]:
-        beside += _columns(record, side, name)
+    readings, beside = (
+        [column for name in names for column in _columns(record, side, name)] for names in way
+    )
     smooth = record.points[f"{side}_velocity"]
     still = np.zeros(len(smooth), dtype=np.bool_)
     for rows in rests_at(record, side, noise[source]):
@@ -390,17 +400,18 @@ def _run(
     positions = np.convolve(kernel(length, dt, 0), corner_weights(length, dt))
     louder = tuple(
         (i, noise[s].after(*((positions, dt) if s in PAIR else (weights, dt * step))))
-        for i, column in [*enumerate(beside), (-1, reading)]
+        for i, column in [*enumerate(beside), *((-1, column) for column in readings)]
         for s in column.signals
     )
     return _Run(
         record,
-        rows=reading.rows,
-        points=reading.points,
+        rows=np.sum([column.rows for column in readings], axis=0),
+        points=np.sum([column.points for column in readings], axis=0),
         beside=np.column_stack([column.rows for column in beside]),
         at_points=np.column_stack([column.points for column in beside]),
         smooth=smooth,
         still=still,
+        length=length,
         weights=weights,
         loud=grid.velocity_noise(source, noise[source]),
         louder=louder,

@@ -75,7 +75,7 @@ def test_a_law_that_few_reversals_show_does_not_run_off_where_noise_is_taken_off
     for name, key in (("motor_stribeck_extra", "M_TS"), ("motor_stribeck_velocity", "M_VS")):
         true, error = found.parameters[key], solution.stderr[name]
         assert error is not None
-        assert abs(solution.values[name] - true) < min(2 * error, 0.3 * true)
+        assert abs(solution.values[name] - true) < min(2 * error, 0.2 * true)
 
 
 def test_most_intervals_hold_the_truth_and_none_is_far_off() -> None:
