@@ -54,8 +54,8 @@ SLOWEST: Final = 4
 is the same. With a node at zero speed, or a lower one, the instants of the turns decide of the
 step, which then came out with the wrong sign on one of nine joints."""
 ROUNDS: Final = 3
-"""Rounds: inertia and friction come from the velocities that they correct. The third changes a
-velocity by a hundredth of what the first does."""
+"""Rounds: inertia and friction come from the velocities that they correct. After the second little
+changes."""
 REWEIGHTED: Final = 5
 """Rounds of reweighting in each of them."""
 STEPS: Final = 40
@@ -193,6 +193,8 @@ def with_corners(
         points, smooth = {**record.points, **found}, {**record.smooth, **found}
         return replace(record, points=points, smooth=smooth), sum(len(v) for v in found.values())
 
+    if not corners:
+        return record
     law = tuple(sorted(corners.items())), tuple(sorted(noise.items(), key=_first))
     cornered: WeakRecord = cache_of("corners").get(record, law, make, KEPT)
     return cornered
