@@ -49,10 +49,16 @@ rest lie above.
 ALIKE: Final = 0.1
 """Weight of a row that holds two neighbours in a curve of friction alike: a hundredth of what one
 row in its whole would tell, so that it decides only where a motion has none of that speed."""
-SLOWEST: Final = 4
+STRAIGHT: Final = 1.0
+"""Weight of a row that holds three of them on a straight line: as much as one row in its whole
+tells. Without it the noise of slow rows gave the lowest two nodes opposite signs on some joints;
+with three times as much the smooth turn of others became a step."""
+SLOWEST: Final = 2
 """Kernels of the rows, in time, that a record must spend below the slowest node: friction below it
-is the same. With a node at zero speed, or a lower one, the instants of the turns decide of the
-step, which then came out with the wrong sign on one of nine joints."""
+is the same."""
+TURNS: Final = 8
+"""Turns from which records tell the friction of slow motion: each shows it once, and the mean of
+eight has a third of the scatter of one. With fewer the guess may hide the law that is missing."""
 ROUNDS: Final = 3
 """Rounds: inertia and friction come from the velocities that they correct. After the second little
 changes."""
@@ -97,8 +103,8 @@ class Corner:
     nodes : tuple of float
         Speeds [rad/s].
     friction : pair of tuple of float
-        At the nodes, forward and backward, in units of the inertia [rad/s^2]; the first is that of
-        all slower motion.
+        At the nodes, forward and backward, in units of the inertia [rad/s^2]; the first node is at
+        zero speed, where anything between the two holds the side.
     """
 
     reading: tuple[str, ...]
@@ -246,7 +252,7 @@ def _corner(
     speeds = np.concatenate([np.abs(r.smooth[~r.still & (r.smooth != 0.0)]) for r in runs])
     grid = runs[0].record.grid
     few = whole(SLOWEST * grid.length / (grid.step * grid.dt))
-    if len(speeds) <= few:
+    if len(speeds) <= few or sum(_turns(r) for r in runs) < TURNS:
         return None
     slowest = float(np.partition(speeds, few)[few])
     nodes = _nodes(speeds, max(slowest, *(STILL * r.loud for r in runs)))
@@ -282,10 +288,8 @@ def _corner(
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         values = np.linalg.lstsq(columns / size, left, rcond=COLLINEAR)[0] / size
         friction = values[count:].reshape(2, -1) / inertia
-        if not friction[0, 0] > friction[1, 0]:  # nothing dry
-            friction[:, 0] = float(np.mean(friction[:, 0]))
-        forward, backward = (tuple(own.tolist()) for own in friction)
-        beside_it, speeds_at = tuple(values[:count].tolist()), tuple(nodes.tolist())
+        forward, backward = (tuple(own.tolist()) for own in _turning(friction))
+        beside_it, speeds_at = tuple(values[:count].tolist()), (0.0, *nodes.tolist())
         corner = Corner(*way, inertia, beside_it, speeds_at, (forward, backward))
         motions = [
             r.sticking(corner, motion) if r.told(corner) else motion
@@ -308,8 +312,6 @@ class _Run:
     smooth : (points,) array
         Velocity by its kernel.
     still : (points,) bool array
-    length : float
-        Kernel of that velocity [s].
     weights : (k,) array
         Of :func:`corner_weights`.
     loud : float
@@ -326,7 +328,6 @@ class _Run:
     at_points: FloatArray
     smooth: FloatArray
     still: npt.NDArray[np.bool_]
-    length: float
     weights: FloatArray
     loud: float
     louder: tuple[tuple[int, float], ...]
@@ -337,14 +338,9 @@ class _Run:
         return self.smooth, np.asarray(self.smooth > 0, dtype=np.float64)
 
     def told(self, corner: Corner) -> bool:
-        """Whether the torques are quiet enough to tell corners, and friction is known down to the
-        speeds that the kernel sees at a turn, or changes nothing there.
-        """
+        """Whether the torques are quiet enough to tell corners."""
         parts = (own * (1.0 if i < 0 else corner.beside[i]) for i, own in self.louder)
-        step = max(corner.friction[0][0] - corner.friction[1][0], 0.0)
-        known = corner.nodes[0] <= step * self.length
-        nothing = step * float(np.abs(np.cumsum(self.weights)).max()) <= self.loud
-        return math.hypot(*parts) <= LOUDER * self.loud * corner.inertia and (known or nothing)
+        return math.hypot(*parts) <= LOUDER * self.loud * corner.inertia
 
     def sticking(
         self, corner: Corner, motion: tuple[FloatArray, FloatArray]
@@ -413,7 +409,6 @@ def _run(
         at_points=np.column_stack([column.points for column in beside]),
         smooth=smooth,
         still=still,
-        length=length,
         weights=weights,
         loud=grid.velocity_noise(source, noise[source]),
         louder=louder,
@@ -442,18 +437,41 @@ def _columns(record: WeakRecord, side: str, name: str) -> list[_Column]:
 
 
 def _nodes(speeds: FloatArray, least: float) -> FloatArray:
-    """Nodes (nodes,) of the friction over the speed, each at twice the one before."""
-    count = max(1, math.ceil(math.log2(max(float(np.max(speeds)) / least, 1.0))))
-    return np.asarray(least * 2.0 ** np.arange(count), dtype=np.float64)
+    """Nodes (nodes,) of the friction over the speed, at powers of two: a noise that is read a
+    little higher moves none of them.
+    """
+    first, last = (math.ceil(math.log2(speed)) for speed in (least, float(np.max(speeds))))
+    return np.asarray(2.0 ** np.arange(first, max(last, first + 1)), dtype=np.float64)
+
+
+def _turning(friction: FloatArray) -> FloatArray:
+    """Friction (2, nodes + 1) of either direction from zero speed on: where it rises from the first
+    node to the second, at twice its speed, the turn is as wide as that, and the step at zero is
+    what a straight line leaves of it; else all of it.
+    """
+    middle, half = friction.mean(axis=0)[0], (friction[0] - friction[1]) / 2
+    line = 2 * half[0] - half[1] if friction.shape[1] > 1 else half[0]
+    step = max(0.0, min(half[0], line))
+    return np.column_stack([[middle + step, middle - step], friction])
+
+
+def _turns(run: _Run) -> int:
+    """How often a side changes its direction, noise and rests apart, in the stretches of a run."""
+    count = 0
+    for first, last in zip(run.record.starts[:-1], run.record.starts[1:], strict=True):
+        velocity = run.smooth[first:last]
+        way = np.sign(velocity[np.abs(velocity) > STILL * run.loud])
+        count += int(np.count_nonzero(np.diff(way)))
+    return count
 
 
 def _alike(count: int, nodes: int) -> FloatArray:
-    """Rows (2 nodes - 2, count + 2 nodes) that hold neighbours in a curve alike."""
+    """Rows that hold neighbours in a curve alike, and what is between three of them straight."""
     steps = np.diff(np.eye(nodes), axis=0)
-    none = np.zeros((len(steps), count))
-    apart = np.zeros_like(steps)
-    rows = np.block([[none, steps, apart], [none, apart, steps]])
-    return np.asarray(ALIKE * rows, dtype=np.float64)
+    bends = np.diff(np.eye(nodes), n=2, axis=0) if nodes > 2 else np.zeros((0, nodes))
+    one = np.vstack([ALIKE * steps, STRAIGHT * bends])
+    none, apart = np.zeros((len(one), count)), np.zeros_like(one)
+    return np.asarray(np.block([[none, one, apart], [none, apart, one]]), dtype=np.float64)
 
 
 def _either_way(velocity: FloatArray, forward: FloatArray, nodes: FloatArray) -> Any:
