@@ -6,7 +6,6 @@ linear combination of the motion, and of free curves.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -35,11 +34,6 @@ NODES: Final = 24
 law of fast motion."""
 ROUNDING: Final = 1e-10
 """Share of the largest direction of the columns that rounding over thousands of rows can make."""
-STRETCHES: Final = 8
-"""Stretches of a record whose slopes are compared."""
-SURE: Final = 4.53
-"""Standard errors by which a slope must be there: of an error from eight stretches (Student's t,
-seven degrees of freedom) as rare as three of a known one."""
 HALVINGS: Final = 6
 """Further nodes over a velocity on either side of zero, each at half of the one before: what
 friction does in slow motion, a Stribeck curve or its turn over a few mrad/s, is over before a share
@@ -83,33 +77,6 @@ def motion_of(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
     return [np.ones(len(v)), v, np.sign(v), a[f"{side}_acceleration"], np.sin(q), np.cos(q)]
 
 
-def slope_beside(
-    values: FloatArray, others: Sequence[FloatArray], column: FloatArray
-) -> tuple[float, float]:
-    """Slope of values (rows,) over a column beside others, (rows,) or (rows, k) each, with its
-    standard error: rows depend on each other, so it is that of leaving one of a few stretches out.
-    """
-    basis, _ = np.linalg.qr(scaled(np.column_stack(others)))
-    own = column - basis @ (basis.T @ column)
-    rest = values - basis @ (basis.T @ values)
-    powers = np.array([float(x @ x) for x in np.array_split(own, STRETCHES)])
-    products = np.array(
-        [
-            float(x @ y)
-            for x, y in zip(
-                np.array_split(own, STRETCHES), np.array_split(rest, STRETCHES), strict=True
-            )
-        ]
-    )
-    power = float(powers.sum())
-    if power - powers.max() <= 1e-18 * float(column @ column):
-        return 0.0, math.inf
-    slope = float(products.sum()) / power
-    without = (products.sum() - products) / (power - powers)
-    error = math.sqrt((STRETCHES - 1) / STRETCHES * float(np.sum((without - without.mean()) ** 2)))
-    return slope, error
-
-
 def rest_beside(
     values: FloatArray,
     columns: Sequence[FloatArray],
@@ -123,48 +90,30 @@ def rest_beside(
     `without_far`: from there on, and for as many rounds, rows that are far off say nothing (Yohai
     1987). It finds what is small beside them, but only near where it begins.
     """
-    basis = independent(np.column_stack(columns))
-    rest, scale, _ = _reweighted(values, basis, rounds)
-    for _ in range(rounds if without_far and scale else 0):
-        weight = np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
-        rest = _rest(values, basis, weight)
+    basis = _independent(np.column_stack(columns))
+
+    def beside(weight: FloatArray) -> FloatArray:
+        seen = basis.T * weight
+        solution, *_ = np.linalg.lstsq(seen @ basis, seen @ values, rcond=None)
+        return np.asarray(values - basis @ solution)
+
+    weight, scale, rest = np.ones(len(values)), 0.0, values
+    for _ in range(rounds):
+        rest = beside(weight)
+        scale = DEVIATION * float(np.median(np.abs(rest)))
+        if not scale:
+            return rest
+        weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
+    for _ in range(rounds if without_far else 0):
+        rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
     return rest
 
 
-def weights_beside(values: FloatArray, columns: Sequence[FloatArray], rounds: int) -> FloatArray:
-    """Weight (rows,) of each row in what :func:`rest_beside` leaves."""
-    return _reweighted(values, independent(np.column_stack(columns)), rounds)[2]
-
-
-def _reweighted(
-    values: FloatArray, basis: FloatArray, rounds: int
-) -> tuple[FloatArray, float, FloatArray]:
-    """What is left beside orthonormal columns, its deviation, and the weight of each row, after
-    Huber's rounds.
-    """
-    weight, scale, rest = np.ones(len(values)), 0.0, values
-    for _ in range(rounds):
-        rest = _rest(values, basis, weight)
-        scale = DEVIATION * float(np.median(np.abs(rest)))
-        if not scale:
-            break
-        weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
-    return rest, scale, weight
-
-
-def _rest(values: FloatArray, basis: FloatArray, weight: FloatArray) -> FloatArray:
-    seen = basis.T * weight
-    solution, *_ = np.linalg.lstsq(seen @ basis, seen @ values, rcond=None)
-    return np.asarray(values - basis @ solution)
-
-
-def independent(columns: FloatArray, share: float = ROUNDING) -> FloatArray:
-    """Orthonormal columns that span the same, but for directions that are smaller than such a
-    share of the largest, all columns at unit length.
-    """
+def _independent(columns: FloatArray) -> FloatArray:
+    """Orthonormal columns that span the same, but for directions that rounding makes."""
     basis, within = np.linalg.qr(scaled(columns))
     turned, sizes, _ = np.linalg.svd(within)
-    return np.asarray(basis @ turned[:, sizes > share * sizes[0]])
+    return np.asarray(basis @ turned[:, sizes > ROUNDING * sizes[0]])
 
 
 def bounded(x: FloatArray) -> FloatArray:
@@ -181,15 +130,10 @@ def scaled(matrix: FloatArray) -> FloatArray:
 __all__ = [
     "BIWEIGHT",
     "DEVIATION",
-    "STRETCHES",
-    "SURE",
     "any_curve",
     "bounded",
     "curve_nodes",
-    "independent",
     "motion_of",
     "rest_beside",
     "scaled",
-    "slope_beside",
-    "weights_beside",
 ]

@@ -18,13 +18,13 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.hold import CLOCKS, HOLD_DELAY, HOLD_NAME, UNKNOWNS
 from identification.balance.balances import Balances, balances_of
-from identification.balance.beside import SURE
 from identification.balance.clocks import (
     ENCODERS,
     LOW_PASSED,
     MOST_SKEW,
     NEAR,
     SIGNAL,
+    SURE,
     USUAL_SKEW,
     at_stamps,
     lateness,

@@ -24,14 +24,11 @@ from casadi_models import JointModel
 from casadi_models.hold import CLOCKS
 from identification.balance.beside import (
     DEVIATION,
-    STRETCHES,
-    SURE,
     any_curve,
     bounded,
     motion_of,
     rest_beside,
     scaled,
-    slope_beside,
 )
 from identification.balance.colour import LEVEL_ERROR
 from identification.balance.weak import Filter, WeakRecord
@@ -98,6 +95,9 @@ LEAST_SPREAD: Final = 1e-9
 """Of the logarithm of a fall: rounding."""
 LEAST_SQUARE: Final = 1e-30
 """Of a record without noise [(N.m)^2]: what rounding leaves of torques of 1 N.m."""
+SURE: Final = 4.53
+"""Standard errors by which a channel must be late: of an error from eight stretches (Student's t,
+seven degrees of freedom) as rare as three of a known one."""
 UNLIKE: Final = 2.0
 """Standard errors from which a lateness read through the motor is certainly another: 5 %."""
 ONE_WAY: Final = 1e-3
@@ -114,6 +114,8 @@ ANSWERS: Final = 0.5
 """Share of a shift by which the lateness must be less after it. Where less is, more than half of
 what the rate of a reading moves is its noise, and what was read is none of a clock.
 """
+STRETCHES: Final = 8
+"""Stretches of a record whose slopes are compared."""
 
 
 def carrier(model: JointModel, place: str) -> str | None:
@@ -469,9 +471,9 @@ def lateness(
     kept = steady(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:
-        late, error = slope_beside(*_parts(made, place, kept, torque=torque, by_motor=by_motor))
+        late, error = _slope(*_parts(made, place, kept, torque=torque, by_motor=by_motor))
         if place == "torque_sensor" and not by_motor:
-            sure = slope_beside(*_parts(made, place, kept, torque=torque, through_motor=True))
+            sure = _slope(*_parts(made, place, kept, torque=torque, through_motor=True))
             if abs(late - sure[0]) > UNLIKE * sure[1]:
                 late, error = sure
             # read against the link's encoder, which may itself be late by less than it is shifted
@@ -484,13 +486,38 @@ def lateness(
     one, v, _, bend, *_ = motion_of(a, "link")
     if torque:
         # a damped transmission gives way late, too
-        return *slope_beside(twist, [one, effort, a["torque_rate"], np.sign(v)], v), 0.0
-    late, error = slope_beside(twist, [one, effort, a["drive_rate"], bend, np.sign(v)], v)
+        return *_slope(twist, [one, effort, a["torque_rate"], np.sign(v)], v), 0.0
+    late, error = _slope(twist, [one, effort, a["drive_rate"], bend, np.sign(v)], v)
     # the twist under viscous friction is such a lateness too
-    friction, _ = slope_beside(effort, [one, np.sign(v), bend], v)
-    soft, _ = slope_beside(twist, [one, v, bend], effort)
+    friction, _ = _slope(effort, [one, np.sign(v), bend], v)
+    soft, _ = _slope(twist, [one, v, bend], effort)
     apart = min(abs(friction * soft), abs(late))
     return math.copysign(abs(late) - apart, late), error, apart
+
+
+def _slope(values: FloatArray, others: list[FloatArray], column: FloatArray) -> tuple[float, float]:
+    """Slope over a column beside others, with its standard error: rows depend on each other, so it
+    is that of leaving one of a few stretches out.
+    """
+    basis, _ = np.linalg.qr(scaled(np.column_stack(others)))
+    own = column - basis @ (basis.T @ column)
+    rest = values - basis @ (basis.T @ values)
+    powers = np.array([float(x @ x) for x in np.array_split(own, STRETCHES)])
+    products = np.array(
+        [
+            float(x @ y)
+            for x, y in zip(
+                np.array_split(own, STRETCHES), np.array_split(rest, STRETCHES), strict=True
+            )
+        ]
+    )
+    power = float(powers.sum())
+    if power - powers.max() <= 1e-18 * float(column @ column):
+        return 0.0, math.inf
+    slope = float(products.sum()) / power
+    without = (products.sum() - products) / (power - powers)
+    error = math.sqrt((STRETCHES - 1) / STRETCHES * float(np.sum((without - without.mean()) ** 2)))
+    return slope, error
 
 
 __all__ = [

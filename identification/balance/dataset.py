@@ -24,13 +24,13 @@ from identification.balance.clocks import (
     shifted,
 )
 from identification.balance.colour import ChannelNoise, Part, white
-from identification.balance.corners import Corner, corners_of, rests_at, with_corners
+from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.drawn_noise import doubts_of
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.slow_noise import SlowNoise, power_of, slow_noise_of
-from identification.balance.spikes import TOLD_BY, restored, without_spikes
+from identification.balance.spikes import without_spikes
 from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
@@ -63,6 +63,10 @@ which friction changes its sign within a sample."""
 SHORT_NOISE: Final = 2e-4
 """Noise of the velocity by such a kernel, as a share of the record's speed: friction changes its
 sign over a hundredth of that speed and less, and rest is told from motion there."""
+STILL: Final = 3.0
+"""Pointwise speed of a side at rest, in standard deviations of its noise: 0.3 % of samples at
+rest lie above.
+"""
 NANOSECOND: Final = 1e-9
 """What two shifts may differ by and be the same [s]: no stamp is finer."""
 PREPARED: Final = 16_000_000
@@ -97,8 +101,6 @@ class Dataset:
         Orders per motor turn of lines without a name: what stands there is no named effect.
     colours : mapping of str to ChannelNoise
         Noise of each measured signal that is not white, in the proportions of its parts.
-    corners : mapping of str to Corner
-        By side, from what the corners of its velocities come.
     """
 
     joint: Joint
@@ -113,7 +115,6 @@ class Dataset:
     orders: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     other_orders: tuple[float, ...] = ()
     colours: Mapping[str, ChannelNoise] = field(default_factory=dict)
-    corners: Mapping[str, Corner] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
@@ -128,15 +129,6 @@ class Dataset:
             c: self.colours[c].scaled(level) if c in self.colours else white(level)
             for c, level in self.noise.items()
         }
-
-    def with_corners(self, corners: Mapping[str, Corner]) -> Dataset:
-        """The same records, their velocities with these corners."""
-        noise = self.sources
-        train, held_out = (
-            tuple(with_corners(w, corners, noise) for w in records)
-            for records in (self.train, self.held_out)
-        )
-        return replace(self, train=train, held_out=held_out, corners=corners)
 
     def with_slow_noise(self, slow: Mapping[str, SlowNoise]) -> Dataset:
         """The same records, the readings of some signals drifting and humming by as much at
@@ -277,7 +269,7 @@ def load_dataset(
         if told is None
         else (told.noise, told.colours)
     )
-    data = Dataset(
+    return Dataset(
         joint,
         sensing,
         train=tuple(prepared[:count]),
@@ -288,10 +280,6 @@ def load_dataset(
         held_out_names=tuple(r.name for r in held_out),
         colours=colours,
     )
-    if told is not None:
-        return data.with_corners(told.corners)
-    alike = [w for w, r in zip(prepared, train, strict=False) if r.payload == train[0].payload]
-    return data.with_corners(corners_of(alike, data.sources, sensing))
 
 
 def _noise_of_all(
@@ -502,17 +490,22 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
         source = f"{side}_position"
         if source not in noise:
             continue
+        still_speed = STILL * made.grid.velocity_noise(source, noise[source])
+        slow = np.abs(made.points[f"{side}_velocity"]) <= still_speed
+        shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
+        still = np.zeros(len(slow))
         tables = [t for t in (smooth, paired, *doubts) if source in t]
         for t in tables:
             t[source] = t[source].copy()
-        still = np.zeros(len(made.points[source]))
-        for rows in rests_at(made, side, noise[source]):
-            still[rows] = 1.0
-            for t in tables:
-                held = t[source]
-                held[rows] = np.linspace(
-                    held[rows.start], held[rows.stop - 1], rows.stop - rows.start
-                )
+        for first, last in zip(made.starts[:-1], made.starts[1:], strict=True):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], slow[first:last], [False]])))
+            for begin, end in edges.reshape(-1, 2):
+                if end - begin >= shortest:
+                    rows = slice(first + begin, first + end)
+                    still[rows] = 1.0
+                    for t in tables:
+                        held = t[source]
+                        held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
         out[side] = made.average(still) if still.any() else np.zeros(made.rows)
         stills.append(still)
     if len(stills) == 2:

@@ -939,8 +939,7 @@ def _held_out_drop(
     before, after = before[here], after[here]
     theirs, ours = base.held_weight[here], base.weight[base.balance == where]
     noise *= float(theirs @ theirs) / max(float(ours @ ours), 1e-300)
-    with np.errstate(over="ignore"):  # a size that the training rows hardly hold
-        left = max(float(after @ after) - noise, 0.0)
+    left = max(float(after @ after) - noise, 0.0)
     return 100 * (1 - math.sqrt(left / max(float(before @ before), 1e-300)))
 
 

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from casadi_models.term import LINK_INERTIA
-from identification.balance.corners import with_corners
 from identification.balance.dataset import (
     LINK_BALANCES,
     Dataset,
@@ -381,7 +380,6 @@ def predicted(followed: Followed, run: Run, data: Dataset) -> WeakRecord:
     length = min(data.kernel, usual_kernel(sensing, data.joint))
     made = weak_record(record, data.joint, sensing, length, curved=bool(old.curved))
     masked = frozenset(sensing.balances) & LINK_BALANCES if run.load != 1 else frozenset()
-    made = with_corners(made, data.corners, data.sources)
     return replace(made, name=run_name(record), masked=masked)
 
 
