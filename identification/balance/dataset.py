@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel, hold
-from casadi_models.term import SIDE_INERTIAS
+from casadi_models.term import LOAD_COMPLIANCE, SIDE_INERTIAS
 from identification.balance.calibration import named_late, of_run, start_values, unknowns_of
 from identification.balance.clocks import (
     SIGNAL,
@@ -351,13 +351,15 @@ def _of_the_link(record: Record, sensing: Sensing) -> frozenset[str]:
 
 def seen_from_the_motor(sensing: Sensing, joint: Joint) -> bool:
     """True for a joint with a transmission of which only the drive side is recorded: the load hangs
-    on a compliance nobody measures. A linear axis has its screw or belt, whatever its ratio says.
+    on a compliance nobody measures. A linear axis has its screw or belt, whatever its ratio says;
+    one whose fitted values know of none was fitted as rigid, and is.
     """
+    linear = joint.kind == "linear" and (not joint.fitted or LOAD_COMPLIANCE.name in joint.fitted)
     return (
         sensing.balances == ("axis",)
         and sensing.moving == "motor_position"
         and not sensing.both_positions
-        and (abs(joint.gear_ratio) != 1.0 or joint.kind == "linear")
+        and (abs(joint.gear_ratio) != 1.0 or linear)
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import EFFECTS, JointModel
-from casadi_models.term import LINK_INERTIA, TOTAL_INERTIA
+from casadi_models.term import LINK_INERTIA, LOAD_COMPLIANCE, TOTAL_INERTIA
 from identification.balance.balances import balances_of
 from identification.balance.calibration import names_of_runs, of_run
 from identification.balance.dataset import HOLD_NAME, Dataset, prepared_model
@@ -364,6 +364,10 @@ def _prepared(
         )
     free = replace(reference, known={})
     stands = {n: k.value for n, k in reference.held().known.items() if k.value is not None}
+    rigid = stands.get(LOAD_COMPLIANCE.name) == 0.0
+    if rigid and not any(t.effect.needs_load for t in plain.terms):
+        # no link swung unseen in the reference: what hangs on one is nothing that changed
+        plain = replace(plain, lagging_load=False, load_from=reference.model().load_from)
     plain = plain.with_values({n: v for n, v in stands.items() if n in plain.parameter_names})
     data = dataset_of(records, [], free, plain)
     if data.blocks < FEWEST_BLOCKS:
