@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from casadi_models.hold import HOLD_NAME
 from identification.balance.balances import Balances
 from identification.balance.calibration import settled
 from identification.balance.excitation import rest_note
@@ -162,10 +163,11 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
     worst = worst_window(time, np.asarray(power), WORST, stretch)
     floor = {b: e.floor for b, e in error.balances.items()}
     above = None
+    # what a drive holds is found in each run, as its clocks are: that is no fit
+    own = any(n != HOLD_NAME for n in fitted.solution.free)
     if linear:  # the one place that fits models without physics: no other verb loads them
         from identification.linear.ceiling import ceiling
 
-        own = bool(fitted.solution.free)
         above = ceiling(fitted.data, compared, residual, floor, unseen=unseen, fitted=own)
     return Comparison(
         ", ".join(r.name for r in given),
@@ -180,7 +182,7 @@ def compare(fitted: Fit, records: Record | Sequence[Record], *, linear: bool = T
             "N.m" if data.joint.kind == "rotary" else "N",
         ),
         warnings=gate_warnings(given),
-        fitted_to=tuple(r.name for r in fitted.records) if fitted.solution.free else (),
+        fitted_to=tuple(r.name for r in fitted.records) if own else (),
     )
 
 

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identification import improve
+from casadi_models.hold import HOLD_NAME
+from identification import compare, improve
 from identification.balance.balances import Balances
 from identification.balance.dataset import load_dataset, prepared_model
 from identification.data.joint_file import Joint
@@ -127,6 +129,34 @@ def test_a_linear_axis_has_a_transmission_whatever_its_ratio_says(kind: str, see
         assert found["inertia"] == pytest.approx(MOTOR + LINK, rel=1e-3)
         assert found["swinging_share"] == pytest.approx(LINK / (MOTOR + LINK), rel=0.02)
         assert found["load_compliance"] == pytest.approx(1 / STIFFNESS, rel=0.02)
+
+
+def test_a_linear_axis_that_was_fitted_as_rigid_is_rigid() -> None:
+    record = swinging(STIFFNESS)
+    bare = Joint(name="carriage", kind="linear", gear_ratio=1.0, model_name="hd1", effects=())
+    rigid = replace(bare, fitted={"inertia": MOTOR + LINK})
+    swings = replace(bare, fitted={"inertia": MOTOR + LINK, "load_compliance": 0.0})
+    assert [prepared_model(j, record).lagging_load for j in (bare, rigid, swings)] == [1, 0, 1]
+
+
+def test_what_a_drive_holds_is_no_fit() -> None:
+    """Values that stand were said to be fitted to the record that they are judged on."""
+    geared = swinging(STIFFNESS)
+    record = Record.from_channels(
+        geared.time,
+        {
+            "motor_current": geared["motor_torque"],
+            "motor_position": geared["motor_position"],
+        },
+        name="run",
+    )
+    joint = replace(bare_joint(), torque_per_current=RATIO)
+    found = fit(joint, [record])
+    assert compare(found, [record], linear=False).fitted_to == ("run",)
+    written = {n: v for n, v in found.solution.values.items() if n != HOLD_NAME}
+    standing = fit(replace(joint, fitted=written).held(), [record])
+    assert standing.solution.free == (HOLD_NAME,)
+    assert compare(standing, [record], linear=False).fitted_to == ()
 
 
 def test_a_rigid_joint_has_no_compliance_to_find() -> None:
