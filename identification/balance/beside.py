@@ -15,6 +15,7 @@ import numpy.typing as npt
 from identification.balance.weak import WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 DEVIATION: Final = 1.4826
 """Standard deviation of a normal value over the median of its size."""
@@ -34,6 +35,8 @@ NODES: Final = 24
 law of fast motion."""
 ROUNDING: Final = 1e-10
 """Share of the largest direction of the columns that rounding over thousands of rows can make."""
+AT_A_TIME: Final = 2048
+"""Rows multiplied or turned at a time: with a hundred columns they stay in the cache."""
 HALVINGS: Final = 6
 """Further nodes over a velocity on either side of zero, each at half of the one before: what
 friction does in slow motion, a Stribeck curve or its turn over a few mrad/s, is over before a share
@@ -64,11 +67,32 @@ def any_curve(
     `nodes`: those of a curve that other records have, too; else the record's own. `turning`: the
     signal with whose sign the curve turns its own, as friction does.
     """
+    from scipy.sparse import csr_array
+
     points = record.points[signal]
     nodes = curve_nodes([record], signal) if nodes is None else nodes
-    sign = 1.0 if turning is None else np.sign(record.points[turning])
-    hats = [sign * np.interp(points, nodes, unit) for unit in np.eye(len(nodes))]
-    return np.column_stack([record.average(hat)[kept] for hat in hats])
+    left, share = between(points, nodes)
+    shares = np.column_stack([1.0 - share, share])
+    if turning is not None:
+        shares *= np.sign(record.points[turning])[:, None]
+    # two values to a point: with its zeros the matrix is ten times as many
+    curve = csr_array(
+        (shares.ravel(), (left[:, None] + (0, 1)).ravel(), 2 * np.arange(len(points) + 1)),
+        shape=(len(points), len(nodes) + 1),
+    )
+    averaged = (record.averaging @ curve).toarray()
+    return np.asarray(averaged[:, : len(nodes)][kept], dtype=np.float64)
+
+
+def between(points: FloatArray, nodes: FloatArray) -> tuple[IntArray, FloatArray]:
+    """The node (n,) to the left of each point (n,), and how much of the way to the next one it is
+    beyond it, 0 to 1; outside the nodes as at the first or the last.
+    """
+    left = np.clip(np.searchsorted(nodes, points, side="right") - 1, 0, max(len(nodes) - 2, 0))
+    if len(nodes) < 2:
+        return left, np.zeros(len(points))
+    share = (points - nodes[left]) / np.diff(nodes)[left]
+    return left, np.clip(share, 0.0, 1.0, out=share)
 
 
 def motion_of(a: Mapping[str, FloatArray], side: str) -> list[FloatArray]:
@@ -90,11 +114,21 @@ def rest_beside(
     `without_far`: from there on, and for as many rounds, rows that are far off say nothing (Yohai
     1987). It finds what is small beside them, but only near where it begins.
     """
-    basis = _independent(np.column_stack(columns))
+    return rest_over(values, independent(np.column_stack(columns)), rounds, without_far=without_far)
+
+
+def rest_over(
+    values: FloatArray, basis: FloatArray, rounds: int, *, without_far: bool = False
+) -> FloatArray:
+    """:func:`rest_beside` what a basis (rows, k) of :func:`independent` spans."""
 
     def beside(weight: FloatArray) -> FloatArray:
-        seen = basis.T * weight
-        solution, *_ = np.linalg.lstsq(seen @ basis, seen @ values, rcond=None)
+        root = np.sqrt(weight)
+        products = sum(
+            (_squared(basis[rows] * root[rows, None]) for rows in _in_turn(len(basis))),
+            np.zeros((basis.shape[1],) * 2),
+        )
+        solution, *_ = np.linalg.lstsq(products, (weight * values) @ basis, rcond=None)
         return np.asarray(values - basis @ solution)
 
     weight, scale, rest = np.ones(len(values)), 0.0, values
@@ -109,11 +143,31 @@ def rest_beside(
     return rest
 
 
-def _independent(columns: FloatArray) -> FloatArray:
-    """Orthonormal columns that span the same, but for directions that rounding makes."""
-    basis, within = np.linalg.qr(scaled(columns))
-    turned, sizes, _ = np.linalg.svd(within)
-    return np.asarray(basis @ turned[:, sizes > ROUNDING * sizes[0]])
+def independent(columns: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+    """Columns that span the same as those given (rows, k), but for directions that rounding makes,
+    orthonormal where each row counts by its weight (rows,). They take the place of the given ones.
+    """
+    triangle = np.empty((0, columns.shape[1]))
+    for rows in _in_turn(len(columns)):
+        part = columns[rows] if weight is None else columns[rows] * np.sqrt(weight[rows])[:, None]
+        triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, part]), mode="r"))
+    size = np.maximum(np.linalg.norm(triangle, axis=0), 1e-300)
+    _, sizes, directions = np.linalg.svd(triangle / size, full_matrices=False)
+    kept = sizes > ROUNDING * sizes[0]
+    turn = directions[kept].T / sizes[kept] / size[:, None]
+    for rows in _in_turn(len(columns)):
+        columns[rows, : turn.shape[1]] = columns[rows] @ turn
+    return columns[:, : turn.shape[1]]
+
+
+def _in_turn(count: int) -> list[slice]:
+    """So many rows, :data:`AT_A_TIME` of them at a time."""
+    return [slice(first, first + AT_A_TIME) for first in range(0, count, AT_A_TIME)]
+
+
+def _squared(rows: FloatArray) -> FloatArray:
+    """Products (k, k) of the columns of rows (n, k)."""
+    return np.asarray(rows.T @ rows)
 
 
 def bounded(x: FloatArray) -> FloatArray:
@@ -131,9 +185,12 @@ __all__ = [
     "BIWEIGHT",
     "DEVIATION",
     "any_curve",
+    "between",
     "bounded",
     "curve_nodes",
+    "independent",
     "motion_of",
     "rest_beside",
+    "rest_over",
     "scaled",
 ]

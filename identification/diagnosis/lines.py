@@ -13,6 +13,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from typing import Any, Final, final
 
 import casadi as ca
@@ -392,8 +393,8 @@ def highest_order(samples: Samples, dt: float) -> float:
 @final
 @dataclass(frozen=True)
 class _Tracked:
-    """A balance at one smoothing, ready for the scan: samples of training and held-out records with
-    the trend taken out.
+    """A balance at one smoothing, ready for the scan: samples of training records with the trend
+    taken out, and what makes those of the held-out ones, where there are any.
 
     `direct` where no acceleration enters.
     """
@@ -401,9 +402,14 @@ class _Tracked:
     balance: str
     smoothed: int
     train: Samples
-    held: Samples | None
+    unseen: Callable[[], Samples | None]
     dt: float
     direct: bool
+
+    @cached_property
+    def held(self) -> Samples | None:
+        """Samples of the held-out records: only a peak asks for them, and they may be many."""
+        return self.unseen()
 
 
 @final
@@ -465,38 +471,40 @@ def _tracked(
     law = _Pointwise(solution.model, data.sensing)
     known = {w.name: w for w in (*data.train, *data.held_out)}
     found = settled(solution.model, data.sensing, list(known.values()), solution.values)
-    runs, unseen = (
-        tuple(at_every_sample(r, data.joint, data.sensing, known.get(run_name(r))) for r in part)
-        for part in (train, held_out)
-    )
-    residuals = [
-        [law.at(w, values_on(solution.model, w, found)) for w in part] for part in (runs, unseen)
-    ]
+
+    def part(
+        records: Sequence[Record], prepared: Sequence[WeakRecord]
+    ) -> tuple[tuple[WeakRecord, ...], dict[str, _Joined]]:
+        """Runs, and those of them that take part in each balance."""
+        runs = tuple(
+            at_every_sample(r, data.joint, data.sensing, known.get(run_name(r))) for r in records
+        )
+        residuals = [law.at(w, values_on(solution.model, w, found)) for w in runs]
+        joined = {}
+        for b in law.balances:
+            kept = _taking(b, runs, prepared)
+            if any(kept):
+                each = [r[b] for r in itertools.compress(residuals, kept)]
+                joined[b] = _Joined(
+                    tuple(itertools.compress(runs, kept)),
+                    np.concatenate(each),
+                    _angle_factor(data.joint),
+                )
+        return runs, joined
+
+    runs, joined = part(train, data.train)
+
+    @cache
+    def apart() -> dict[str, _Joined]:
+        return part(held_out, data.held_out)[1]
+
+    def unseen(balance: str) -> _Joined | None:
+        return apart().get(balance)
+
     out: list[_Tracked] = []
-    for balance in law.balances:
-        joined = [
-            _Joined(
-                tuple(itertools.compress(part, kept)),
-                np.concatenate(
-                    [r[balance] for r in itertools.compress(found, kept)] or [np.empty(0)]
-                ),
-                factor,
-            )
-            for part, found, kept, factor in zip(
-                (runs, unseen),
-                residuals,
-                (_taking(balance, runs, data.train), _taking(balance, unseen, data.held_out)),
-                (_angle_factor(data.joint),) * 2,
-                strict=True,
-            )
-        ]
-        if joined[0].runs:
-            out += _without_trend(
-                balance,
-                joined[0],
-                joined[1] if joined[1].runs else None,
-                direct=balance in law.at_rest_too,
-            )
+    for b in joined:
+        direct = b in law.at_rest_too
+        out += _without_trend(b, joined[b], partial(unseen, b), direct=direct)
     return out, runs
 
 
@@ -508,7 +516,7 @@ def _taking(balance: str, runs: Sequence[WeakRecord], prepared: Sequence[WeakRec
 
 
 def _without_trend(
-    balance: str, train: _Joined, held: _Joined | None, *, direct: bool
+    balance: str, train: _Joined, unseen: Callable[[], _Joined | None], *, direct: bool
 ) -> list[_Tracked]:
     """Samples of a balance without what depends on velocity, acceleration and slowly on the
     position.
@@ -521,17 +529,33 @@ def _without_trend(
         return []
     knots, ends = velocity_knots(velocity), (float(angle.min()), float(angle.max()))
 
-    def columns(of: _Joined) -> FloatArray:
+    def without(of: _Joined) -> Callable[[FloatArray], FloatArray]:
         slow = [of.signal(n, smooth=True) for n in ("motor_velocity", "motor_acceleration")]
-        return trend(of.factor * of.signal("motor_position"), slow[0], slow[1], knots, ends)
+        place = of.factor * of.signal("motor_position")
+        return beside(trend(place, slow[0], slow[1], knots, ends), of.weight)
 
-    parts = [(of, beside(columns(of), of.weight)) for of in (train, held) if of is not None]
-    out = []
-    for smoothed in SMOOTHED:
-        left = [_beside(of.samples(smoothed), taken) for of, taken in parts]
-        apart = left[1] if held is not None else None
-        out.append(_Tracked(balance, smoothed, left[0], apart, train.runs[0].grid.dt, direct))
-    return out
+    taken = without(train)
+
+    @cache
+    def held() -> tuple[_Joined, Callable[[FloatArray], FloatArray]] | None:
+        of = unseen()
+        return None if of is None else (of, without(of))
+
+    def apart(smoothed: int) -> Samples | None:
+        of = held()
+        return None if of is None else _beside(of[0].samples(smoothed), of[1])
+
+    return [
+        _Tracked(
+            balance,
+            n,
+            _beside(train.samples(n), taken),
+            partial(apart, n),
+            dt=train.runs[0].grid.dt,
+            direct=direct,
+        )
+        for n in SMOOTHED
+    ]
 
 
 def _beside(samples: Samples, taken: Callable[[FloatArray], FloatArray]) -> Samples:

@@ -21,6 +21,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.beside import between, independent
 from identification.fitting.covariance import follows
 
 FloatArray = npt.NDArray[np.float64]
@@ -192,9 +193,16 @@ def trend(
     """
     middle, half = (span[0] + span[1]) / 2, max((span[1] - span[0]) / 2, 1e-300)
     x = (angle - middle) / half
-    hats = [np.interp(velocity, knots, row) for row in np.eye(len(knots))]
+    left, share = between(velocity, knots)
+    rows = np.arange(len(velocity))
     size = float(np.max(np.abs(acceleration), initial=1e-300))
-    return np.column_stack([*hats, x, x**2, x**3, acceleration / size])
+    out = np.zeros((len(velocity), len(knots) + 4))
+    out[rows, left], out[rows, left + 1] = 1.0 - share, share
+    for column, values in zip(
+        out.T[len(knots) :], (x, x**2, x**3, acceleration / size), strict=True
+    ):
+        column[:] = values
+    return out
 
 
 def velocity_knots(velocity: FloatArray) -> FloatArray:
@@ -217,13 +225,13 @@ def beside(columns: FloatArray, weight: FloatArray) -> Callable[[FloatArray], Fl
     Parameters
     ----------
     columns : (n, k) array
+        Written over.
     weight : (n,) array
     """
-    root = np.sqrt(weight)
-    solving = np.linalg.pinv(columns * root[:, None], rcond=1e-10) * root
+    basis = independent(columns, weight)
 
     def left(values: FloatArray) -> FloatArray:
-        return np.asarray(values - columns @ (solving @ values), dtype=np.float64)
+        return np.asarray(values - basis @ ((weight * values) @ basis), dtype=np.float64)
 
     return left
 

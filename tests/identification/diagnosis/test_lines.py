@@ -406,7 +406,7 @@ def lines_in(
     held: Samples | None = None,
 ) -> list[Line]:
     """What is found in the residuals of some balances of a joint."""
-    tracked = [_Tracked(b, 1, s, held, 1e-2, direct=True) for b, s in samples.items()]
+    tracked = [_Tracked(b, 1, s, lambda: held, 1e-2, direct=True) for b, s in samples.items()]
     monkeypatch.setattr("identification.diagnosis.lines._tracked", lambda *_: (tracked, ()))
     data: Any = SimpleNamespace(sensing=SimpleNamespace(clamped_link=False), joint=joint)
     nothing: Any = None
@@ -555,7 +555,7 @@ def test_two_records_at_rest_in_two_places_have_no_line() -> None:
     residual = np.concatenate([np.cos(w.time) for w in runs])
     for some in (runs, runs[1:]):
         joined = _Joined(tuple(some), residual[: 1000 * len(some)], 1.0)
-        assert _without_trend("link", joined, None, direct=True) == []
+        assert _without_trend("link", joined, lambda: None, direct=True) == []
 
 
 CASES = (

@@ -445,7 +445,7 @@ def test_the_error_of_a_line_is_the_scatter_of_its_phase_in_noise() -> None:
         samples = along(angle, noise, weight)
         sines.append(phase_fit(2.3, samples)[0])
         if seed < 6:
-            tracked = _Tracked("motor", 1, samples, None, 1e-2, direct=True)
+            tracked = _Tracked("motor", 1, samples, lambda: None, 1e-2, direct=True)
             errors.append(_noise(line(2.3), tracked))
     assert np.mean(errors) == pytest.approx(np.sqrt(np.mean(np.square(sines))), rel=0.2)
 
@@ -471,7 +471,7 @@ def test_noise_that_rises_with_the_order_is_seen_beyond_half_of_the_sampling_rat
         samples = along(angle, orders @ np.sin(phase), weight)
         sines.append(phase_fit(2.3, samples)[0])
         if seed < 12:
-            coarse = _Tracked("motor", 1, samples, None, 10.0, direct=True)
+            coarse = _Tracked("motor", 1, samples, lambda: None, 10.0, direct=True)
             assert highest_order(samples, coarse.dt) < 2.3
             errors.append(_noise(line(2.3), coarse))
     assert 0.9 < np.mean(errors) / np.sqrt(np.mean(np.square(sines))) < 2.0
