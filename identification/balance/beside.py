@@ -7,7 +7,8 @@ linear combination of the motion, and of free curves.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -114,33 +115,54 @@ def rest_beside(
     `without_far`: from there on, and for as many rounds, rows that are far off say nothing (Yohai
     1987). It finds what is small beside them, but only near where it begins.
     """
-    return rest_over(values, independent(np.column_stack(columns)), rounds, without_far=without_far)
+    return Basis.of(columns).rest(values, rounds, without_far=without_far)
 
 
-def rest_over(
-    values: FloatArray, basis: FloatArray, rounds: int, *, without_far: bool = False
-) -> FloatArray:
-    """:func:`rest_beside` what a basis (rows, k) of :func:`independent` spans."""
+@final
+@dataclass(frozen=True)
+class Basis:
+    """What values are laid beside, made once for all of them.
 
-    def beside(weight: FloatArray) -> FloatArray:
-        root = np.sqrt(weight)
-        products = sum(
-            (_squared(basis[rows] * root[rows, None]) for rows in _in_turn(len(basis))),
-            np.zeros((basis.shape[1],) * 2),
-        )
-        solution, *_ = np.linalg.lstsq(products, (weight * values) @ basis, rcond=None)
-        return np.asarray(values - basis @ solution)
+    Attributes
+    ----------
+    columns : (rows, k) array
+        Orthonormal.
+    products : (k, k) array
+        Of the columns.
+    """
 
-    weight, scale, rest = np.ones(len(values)), 0.0, values
-    for _ in range(rounds):
-        rest = beside(weight)
-        scale = DEVIATION * float(np.median(np.abs(rest)))
-        if not scale:
-            return rest
-        weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
-    for _ in range(rounds if without_far else 0):
-        rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
-    return rest
+    columns: FloatArray
+    products: FloatArray
+
+    @classmethod
+    def of(cls, columns: Sequence[FloatArray]) -> Basis:
+        """Of columns, (rows,) or (rows, k) each."""
+        basis = independent(np.column_stack(columns))
+        return cls(basis, _products(basis))
+
+    def rest(
+        self, values: FloatArray, rounds: int = REWEIGHTED, *, without_far: bool = False
+    ) -> FloatArray:
+        """See :func:`rest_beside`."""
+
+        def beside(weight: FloatArray) -> FloatArray:
+            # most rows count whole: what the others lack is taken off
+            less = np.flatnonzero(weight != 1.0)
+            lacking = _products(self.columns, less, 1.0 - weight[less])
+            seen = (weight * values) @ self.columns
+            solution, *_ = np.linalg.lstsq(self.products - lacking, seen, rcond=None)
+            return np.asarray(values - self.columns @ solution)
+
+        weight, scale, rest = np.ones(len(values)), 0.0, values
+        for _ in range(rounds):
+            rest = beside(weight)
+            scale = DEVIATION * float(np.median(np.abs(rest)))
+            if not scale:
+                return rest
+            weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
+        for _ in range(rounds if without_far else 0):
+            rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
+        return rest
 
 
 def independent(columns: FloatArray, weight: FloatArray | None = None) -> FloatArray:
@@ -165,9 +187,16 @@ def _in_turn(count: int) -> list[slice]:
     return [slice(first, first + AT_A_TIME) for first in range(0, count, AT_A_TIME)]
 
 
-def _squared(rows: FloatArray) -> FloatArray:
-    """Products (k, k) of the columns of rows (n, k)."""
-    return np.asarray(rows.T @ rows)
+def _products(
+    columns: FloatArray, rows: IntArray | None = None, weight: FloatArray | None = None
+) -> FloatArray:
+    """Products (k, k) of columns (rows, k): of all rows, or of some that count by a weight."""
+    out = np.zeros((columns.shape[1],) * 2)
+    for part in _in_turn(len(columns) if rows is None else len(rows)):
+        seen = columns[part if rows is None else rows[part]]
+        seen = seen if weight is None else seen * np.sqrt(weight[part])[:, None]
+        out += seen.T @ seen
+    return out
 
 
 def bounded(x: FloatArray) -> FloatArray:
@@ -183,6 +212,7 @@ def scaled(matrix: FloatArray) -> FloatArray:
 
 __all__ = [
     "BIWEIGHT",
+    "Basis",
     "DEVIATION",
     "any_curve",
     "between",
@@ -191,6 +221,5 @@ __all__ = [
     "independent",
     "motion_of",
     "rest_beside",
-    "rest_over",
     "scaled",
 ]

@@ -29,7 +29,7 @@ from identification.balance.drawn_noise import doubts_of
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
-from identification.balance.slow_noise import SlowNoise, power_of, slow_noise_of
+from identification.balance.slow_noise import SlowNoise, drifts_of, power_of, slow_noise_of
 from identification.balance.spikes import without_spikes
 from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
@@ -288,7 +288,8 @@ def _noise_of_all(
     """Level and colour of the noise of each measured signal; `prepared` are the training records
     and then the held-out ones, whose sensors are the same.
     """
-    slow = _of_one_make([slow_noise_of(made) for made in prepared])
+    trained, others = prepared[: len(train)], prepared[len(train) :]
+    slow = _of_one_make([*map(slow_noise_of, trained), *map(drifts_of, others)])
     found = [
         _with_slow(measured_sources(r, joint, sensing), own)
         for r, own in zip(train, slow, strict=False)

@@ -29,6 +29,7 @@ from scipy.linalg import block_diag
 from identification.balance.beside import (
     BIWEIGHT,
     DEVIATION,
+    Basis,
     any_curve,
     curve_nodes,
     motion_of,
@@ -149,26 +150,51 @@ def slow_noise_of(record: WeakRecord) -> dict[str, SlowNoise]:
     return found
 
 
+def drifts_of(record: WeakRecord) -> dict[str, SlowNoise]:
+    """As :func:`slow_noise_of`, of a record whose hum nobody asks for: where both torques are
+    measured every drift needs the drive beside the transmitted one to agree, and so nothing else
+    is asked where that certainly stands.
+    """
+    if "both" not in _keys(record):
+        return slow_noise_of(record)
+
+    def make() -> tuple[bool, int]:
+        rows, length = _longest(record)
+        witness = _walk(_calm(_rest_of(record, "both"))[rows], length)
+        return witness is not None and not witness.is_sure(AGREED), 1
+
+    if not cache_of("no drift").get(record, None, make, RECORDS):
+        return slow_noise_of(record)
+    return {key: SlowNoise((), ()) for key in _keys(record) if key != "both"}
+
+
 def rests_of(record: WeakRecord) -> dict[str, FloatArray]:
     """What is left, (rows,), of the drive's torque beside all motion (`drive`), of the same beside
     the transmitted torque, too (`both`), and of that beside its side's motion (`torque`); where
     they are measured. Each beside its own rate as well: clocks and low-passes are no noise.
     """
+    return {key: _rest_of(record, key) for key in _keys(record)}
+
+
+def _keys(record: WeakRecord) -> list[str]:
+    """Names of the rests that there are."""
+    measured = [signal for signal in ("drive", "torque") if signal in record.averaged]
+    return measured if len(measured) < len(("drive", "torque")) else ["drive", "both", "torque"]
+
+
+def _rest_of(record: WeakRecord, key: str) -> FloatArray:
+    """One of :func:`rests_of`, (rows,)."""
     a = record.averaged
     every = np.ones(record.rows, dtype=np.bool_)
     sides = [s for s in ("motor", "link") if f"{s}_position" in a]
-    columns: dict[str, tuple[str, list[FloatArray]]] = {}
-    if "drive" in a:
-        state = [column for side in sides for column in motion_of(a, side)]
-        state += [*_curves(record, sides[0], every), *_warming(record, sides[0], every)]
-        state.append(a["drive_rate"])
-        columns["drive"] = "drive", state
-        if "torque" in a:
-            columns["both"] = "drive", [*state, a["torque"], a["torque_rate"]]
-    if "torque" in a:
-        state = [*motion_of(a, sides[-1]), *_curves(record, sides[-1], every), a["torque_rate"]]
-        columns["torque"] = "torque", [*state, *_warming(record, sides[-1], every)]
-    return {key: rest_beside(a[signal], state, ROUNDS) for key, (signal, state) in columns.items()}
+    signal, own = ("torque", sides[-1]) if key == "torque" else ("drive", sides[0])
+    state = [
+        column for side in ([own] if key == "torque" else sides) for column in motion_of(a, side)
+    ]
+    state += [*_curves(record, own, every), *_warming(record, own, every), a[f"{signal}_rate"]]
+    if key == "both":
+        state += [a["torque"], a["torque_rate"]]
+    return rest_beside(a[signal], state, ROUNDS)
 
 
 def _calm(rest: FloatArray) -> FloatArray:
@@ -397,7 +423,8 @@ def slow_noise_of_rest(
         By signal whose samples do not show the colour of its noise: what is drawn of white noise in
         the rest of each record. What is found counts for a white noise of one.
     """
-    left = {key: _beside_laws(records, key, courses) for key, courses in rests.items()}
+    bases: dict[tuple[str, bytes], Basis] = {}
+    left = {key: _beside_laws(records, key, courses, bases) for key, courses in rests.items()}
     walks: dict[str, _Walk] = {}
     for key, courses in left.items():
         own = [
@@ -508,37 +535,48 @@ def _with_zeros(course: FloatArray) -> FloatArray:
 
 
 def _beside_laws(
-    records: Sequence[WeakRecord], key: str, courses: Sequence[FloatArray]
+    records: Sequence[WeakRecord],
+    key: str,
+    courses: Sequence[FloatArray],
+    bases: dict[tuple[str, bytes], Basis],
 ) -> list[FloatArray]:
     """What is left of each record, (rows,), beside a mean of its own in each of its stretches and
     free curves of speed and place that all have in common: a law is the same in every record, a
     drift is not, and over the few speeds of a sweep a curve of its own would follow it. No number
-    outside the stretches, and where a row takes no part.
+    outside the stretches, and where a row takes no part. `bases` are those made for other torques.
     """
     stretches = [_telling(w) for w in records]
     kept = [
         np.any([rows for rows, _ in own], axis=0) & np.isfinite(course)
         for own, course in zip(stretches, courses, strict=True)
     ]
-    inside = [[rows[k] for rows, _ in own] for own, k in zip(stretches, kept, strict=True)]
     values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
     if not len(values):
         return [np.full(len(course), np.nan) for course in courses]
     sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.points for w in records)]
     side = sides[-1] if key == "torque" else sides[0]
+    mark = side, np.concatenate(kept).tobytes()
+    if mark not in bases:
+        bases[mark] = _laws(records, side, kept)
+    ends = np.cumsum([np.count_nonzero(k) for k in kept])
+    out = [np.full(len(course), np.nan) for course in courses]
+    for own, k, rest in zip(
+        out, kept, np.split(bases[mark].rest(values, ROUNDS), ends[:-1]), strict=True
+    ):
+        own[k] = rest
+    return out
+
+
+def _laws(records: Sequence[WeakRecord], side: str, kept: Sequence[BoolArray]) -> Basis:
+    """What the kept rows of all records are laid beside."""
+    inside = [[rows[k] for rows, _ in _telling(w)] for w, k in zip(records, kept, strict=True)]
     columns = [block_diag(*(np.stack(own, axis=1).astype(np.float64) for own in inside))]
     curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
     columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
     warming = [_warming(w, side, k) for w, k in zip(records, kept, strict=True)]
     if all(warming):
         columns.append(block_diag(*(parts[0] for parts in warming)))
-    ends = np.cumsum([np.count_nonzero(k) for k in kept])
-    out = [np.full(len(course), np.nan) for course in courses]
-    for own, k, rest in zip(
-        out, kept, np.split(rest_beside(values, columns, ROUNDS), ends[:-1]), strict=True
-    ):
-        own[k] = rest
-    return out
+    return Basis.of(columns)
 
 
 def _drift(rate: float, memory: float) -> Part:
@@ -554,6 +592,7 @@ def power_of(lines: Lines) -> float:
 __all__ = [
     "Drawn",
     "SlowNoise",
+    "drifts_of",
     "filtered_noise",
     "power_of",
     "slow_noise_of",
