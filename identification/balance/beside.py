@@ -137,13 +137,18 @@ class Basis:
     @classmethod
     def of(cls, columns: Sequence[FloatArray]) -> Basis:
         """Of columns, (rows,) or (rows, k) each."""
-        basis = independent(np.column_stack(columns))
+        basis = independent(columns)
         return cls(basis, _products(basis))
 
     def rest(
-        self, values: FloatArray, rounds: int = REWEIGHTED, *, without_far: bool = False
+        self,
+        values: FloatArray,
+        rounds: int = REWEIGHTED,
+        *,
+        without_far: bool = False,
+        counting: npt.NDArray[np.bool_] | None = None,
     ) -> FloatArray:
-        """See :func:`rest_beside`."""
+        """See :func:`rest_beside`; `counting`: the rows (rows,) that take part, if not all do."""
 
         def beside(weight: FloatArray) -> FloatArray:
             # most rows count whole: what the others lack is taken off
@@ -153,33 +158,39 @@ class Basis:
             solution, *_ = np.linalg.lstsq(self.products - lacking, seen, rcond=None)
             return np.asarray(values - self.columns @ solution)
 
-        weight, scale, rest = np.ones(len(values)), 0.0, values
+        taken = np.ones(len(values), dtype=np.bool_) if counting is None else counting
+        weight, scale, rest = taken.astype(np.float64), 0.0, values
         for _ in range(rounds):
             rest = beside(weight)
-            scale = DEVIATION * float(np.median(np.abs(rest)))
+            scale = DEVIATION * float(np.median(np.abs(rest[taken])))
             if not scale:
                 return rest
-            weight = LINEAR * scale / np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
+            size = np.maximum(np.abs(rest), max(LINEAR * scale, 1e-300))
+            weight = np.where(taken, LINEAR * scale / size, 0.0)
         for _ in range(rounds if without_far else 0):
-            rest = beside(np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2)
+            near = np.maximum(1.0 - (rest / (BIWEIGHT * scale)) ** 2, 0.0) ** 2
+            rest = beside(np.where(taken, near, 0.0))
         return rest
 
 
-def independent(columns: FloatArray, weight: FloatArray | None = None) -> FloatArray:
-    """Columns that span the same as those given (rows, k), but for directions that rounding makes,
-    orthonormal where each row counts by its weight (rows,). They take the place of the given ones.
+def independent(columns: Sequence[FloatArray], weight: FloatArray | None = None) -> FloatArray:
+    """Columns (rows, any) that span the same as those given, (rows,) or (rows, k) each, but for
+    directions that rounding makes; orthonormal where each row counts by its weight (rows,).
     """
-    triangle = np.empty((0, columns.shape[1]))
-    for rows in _in_turn(len(columns)):
-        part = columns[rows] if weight is None else columns[rows] * np.sqrt(weight[rows])[:, None]
+    count = len(columns[0])
+    triangle = np.empty((0, sum(x[:1].size for x in columns)))
+    for rows in _in_turn(count):
+        part = np.column_stack([x[rows] for x in columns])
+        part = part if weight is None else part * np.sqrt(weight[rows])[:, None]
         triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, part]), mode="r"))
     size = np.maximum(np.linalg.norm(triangle, axis=0), 1e-300)
     _, sizes, directions = np.linalg.svd(triangle / size, full_matrices=False)
     kept = sizes > ROUNDING * sizes[0]
     turn = directions[kept].T / sizes[kept] / size[:, None]
-    for rows in _in_turn(len(columns)):
-        columns[rows, : turn.shape[1]] = columns[rows] @ turn
-    return columns[:, : turn.shape[1]]
+    out = np.empty((count, turn.shape[1]))
+    for rows in _in_turn(count):
+        np.matmul(np.column_stack([x[rows] for x in columns]), turn, out=out[rows])
+    return out
 
 
 def _in_turn(count: int) -> list[slice]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, final
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -327,8 +328,16 @@ def _once(
     scales = (joint.gear_ratio, joint.torque_per_current, joint.torque_per_voltage)
     told = None if known is None else tuple(sorted(known.items()))
     law = (scales, sensing, length, first_block, curved, tuple(late), told)
-    found: WeakRecord = cache_of("prepared").get(record, law, make, PREPARED)
+    living = _LIVING.setdefault(record, WeakValueDictionary())
+    found: WeakRecord = living.get(law) or cache_of("prepared").get(record, law, make, PREPARED)
+    living[law] = found
     return found
+
+
+_LIVING: Final[WeakKeyDictionary[Record, WeakValueDictionary[Hashable, WeakRecord]]] = (
+    WeakKeyDictionary()
+)
+"""Prepared records that somebody holds, however long: to give them again costs nothing."""
 
 
 def run_name(record: Record) -> str:

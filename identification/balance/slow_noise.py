@@ -78,6 +78,8 @@ SAME: Final = 3.0
 of a line after the window."""
 RECORDS: Final = 200
 """Spectra that a thread keeps."""
+BASES: Final = 20_000_000
+"""Values of bases that a thread keeps (160 MB): both of a million samples."""
 FEWEST_PASSES: Final = 4.0
 """Passes over a place in one direction from which a friction over it is no course in time: as many
 as reversals are asked for. A curve of a place that is passed once follows any drift.
@@ -423,8 +425,7 @@ def slow_noise_of_rest(
         By signal whose samples do not show the colour of its noise: what is drawn of white noise in
         the rest of each record. What is found counts for a white noise of one.
     """
-    bases: dict[tuple[str, bytes], Basis] = {}
-    left = {key: _beside_laws(records, key, courses, bases) for key, courses in rests.items()}
+    left = _beside_laws(records, rests)
     walks: dict[str, _Walk] = {}
     for key, courses in left.items():
         own = [
@@ -535,48 +536,59 @@ def _with_zeros(course: FloatArray) -> FloatArray:
 
 
 def _beside_laws(
-    records: Sequence[WeakRecord],
-    key: str,
-    courses: Sequence[FloatArray],
-    bases: dict[tuple[str, bytes], Basis],
-) -> list[FloatArray]:
+    records: Sequence[WeakRecord], rests: Mapping[str, Sequence[FloatArray]]
+) -> dict[str, list[FloatArray]]:
     """What is left of each record, (rows,), beside a mean of its own in each of its stretches and
     free curves of speed and place that all have in common: a law is the same in every record, a
     drift is not, and over the few speeds of a sweep a curve of its own would follow it. No number
-    outside the stretches, and where a row takes no part. `bases` are those made for other torques.
+    outside the stretches, and where a row takes no part.
     """
-    stretches = [_telling(w) for w in records]
-    kept = [
-        np.any([rows for rows, _ in own], axis=0) & np.isfinite(course)
-        for own, course in zip(stretches, courses, strict=True)
-    ]
-    values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
-    if not len(values):
-        return [np.full(len(course), np.nan) for course in courses]
+    telling = [np.any([rows for rows, _ in _telling(w)], axis=0) for w in records]
     sides = [s for s in ("motor", "link") if all(f"{s}_position" in w.points for w in records)]
-    side = sides[-1] if key == "torque" else sides[0]
-    mark = side, np.concatenate(kept).tobytes()
-    if mark not in bases:
-        bases[mark] = _laws(records, side, kept)
-    ends = np.cumsum([np.count_nonzero(k) for k in kept])
-    out = [np.full(len(course), np.nan) for course in courses]
-    for own, k, rest in zip(
-        out, kept, np.split(bases[mark].rest(values, ROUNDS), ends[:-1]), strict=True
-    ):
-        own[k] = rest
-    return out
+    out: dict[str, list[FloatArray]] = {}
+    for side in dict.fromkeys((sides[0], sides[-1])):
+        own = {
+            key: [np.where(t, course, np.nan) for t, course in zip(telling, courses, strict=True)]
+            for key, courses in rests.items()
+            if side == (sides[-1] if key == "torque" else sides[0])
+        }
+        # one basis for all of them: a row that one of them lacks counts for nothing in it
+        kept = [np.any(np.isfinite(each), axis=0) for each in zip(*own.values(), strict=True)]
+        if not any(k.any() for k in kept):
+            out |= own
+            continue
+        laws = _laws(records, side, kept)
+        for courses in own.values():
+            values = np.concatenate([course[k] for course, k in zip(courses, kept, strict=True)])
+            counting = np.isfinite(values)
+            if counting.any():
+                rest = laws.rest(np.where(counting, values, 0.0), ROUNDS, counting=counting)
+                values = np.where(counting, rest, np.nan)
+            ends = np.cumsum([np.count_nonzero(k) for k in kept])
+            for course, k, rest in zip(courses, kept, np.split(values, ends[:-1]), strict=True):
+                course[k] = rest
+        out |= own
+    return {key: out[key] for key in rests}
 
 
 def _laws(records: Sequence[WeakRecord], side: str, kept: Sequence[BoolArray]) -> Basis:
-    """What the kept rows of all records are laid beside."""
-    inside = [[rows[k] for rows, _ in _telling(w)] for w, k in zip(records, kept, strict=True)]
-    columns = [block_diag(*(np.stack(own, axis=1).astype(np.float64) for own in inside))]
-    curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
-    columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
-    warming = [_warming(w, side, k) for w, k in zip(records, kept, strict=True)]
-    if all(warming):
-        columns.append(block_diag(*(parts[0] for parts in warming)))
-    return Basis.of(columns)
+    """What the kept rows of all records are laid beside; the same for every model."""
+
+    def make() -> tuple[tuple[Basis, Sequence[WeakRecord]], int]:
+        inside = [[rows[k] for rows, _ in _telling(w)] for w, k in zip(records, kept, strict=True)]
+        columns = [block_diag(*(np.stack(own, axis=1).astype(np.float64) for own in inside))]
+        curves = [_curves(w, side, k, records) for w, k in zip(records, kept, strict=True)]
+        columns += [np.concatenate(parts) for parts in zip(*curves, strict=True)]
+        warming = [_warming(w, side, k) for w, k in zip(records, kept, strict=True)]
+        if all(warming):
+            columns.append(block_diag(*(parts[0] for parts in warming)))
+        made = Basis.of(columns)
+        # the other records are kept with it: the identity of none is given to another one
+        return (made, records[:-1]), made.columns.size
+
+    law = (side, tuple(map(id, records[:-1])), tuple(k.tobytes() for k in kept))
+    found: Basis = cache_of("laws").get(records[-1], law, make, BASES)[0]
+    return found
 
 
 def _drift(rate: float, memory: float) -> Part:

@@ -103,45 +103,39 @@ def stack(
     model = balances.model
     values = settled(model, balances.sensing, records, values)
     wanted = balances.wrt if names is None else tuple(names)
-    parts = []
-    for w in records:
-        found = balances.evaluate(w, values_on(model, w, values))
-        parts.append(
-            found
-            if names is None
-            else {b: (r, _columns(balances, w, j, wanted)) for b, (r, j) in found.items()}
-        )
-    share = [{b: w.taking(b) for b in balances.balances} for w in records]
-    return Stacked(
-        {
-            b: np.concatenate(
-                [np.where(s[b], p[b][0], 0.0) for p, s in zip(parts, share, strict=True)]
-            )
-            for b in balances.balances
-        },
-        {
-            b: np.concatenate(
-                [np.where(s[b][:, None], p[b][1], 0.0) for p, s in zip(parts, share, strict=True)]
-            )
-            for b in balances.balances
-        },
-        np.concatenate([w.block for w in records]),
-        {b: taking_part(b, records) for b in balances.balances},
+    residual, jacobian = (
+        {b: np.empty((sum(w.rows for w in records), *width)) for b in balances.balances}
+        for width in ((), (len(wanted),))
     )
+    taking = {b: taking_part(b, records) for b in balances.balances}
+    first = 0
+    for w in records:
+        rows = slice(first, first + w.rows)
+        for b, (r, columns) in balances.evaluate(w, values_on(model, w, values)).items():
+            residual[b][rows] = r
+            _fill(jacobian[b][rows], balances, w, columns, wanted)
+        first += w.rows
+    for b, taken in taking.items():
+        residual[b][~taken] = 0.0
+        jacobian[b][~taken] = 0.0
+    return Stacked(residual, jacobian, np.concatenate([w.block for w in records]), taking)
 
 
-def _columns(
-    balances: Balances, record: WeakRecord, jacobian: FloatArray, names: Sequence[str]
-) -> FloatArray:
-    """Columns of the names, those of other runs zero."""
+def _fill(
+    out: FloatArray,
+    balances: Balances,
+    record: WeakRecord,
+    jacobian: FloatArray,
+    names: Sequence[str],
+) -> None:
+    """Write the columns of the names (rows, names), those of other runs zero."""
     if tuple(names) == balances.wrt:
-        return jacobian
-    out = np.zeros((len(jacobian), len(names)))
+        out[:] = jacobian
+        return
     for k, n in enumerate(names):
         (common,) = bare([n])
-        if n in (common, of_run(common, record)):
-            out[:, k] = jacobian[:, balances.wrt.index(common)]
-    return out
+        own = n in (common, of_run(common, record))
+        out[:, k] = jacobian[:, balances.wrt.index(common)] if own else 0.0
 
 
 def taking_part(balance: str, records: Sequence[WeakRecord]) -> npt.NDArray[np.bool_]:

@@ -225,10 +225,9 @@ def beside(columns: FloatArray, weight: FloatArray) -> Callable[[FloatArray], Fl
     Parameters
     ----------
     columns : (n, k) array
-        Written over.
     weight : (n,) array
     """
-    basis = independent(columns, weight)
+    basis = independent([columns], weight)
 
     def left(values: FloatArray) -> FloatArray:
         return np.asarray(values - basis @ ((weight * values) @ basis), dtype=np.float64)

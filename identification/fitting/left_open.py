@@ -164,12 +164,12 @@ class LeftOpen:
             **limits_of_runs(model, [*self.here.data.train, *records]),
             **{n: self.limits[n] for n in self.names},
         }
-        columns = stack(balances, records, values, runs).jacobian
+        begun = there.stacked(np.array([there.values[n] for n in every])).jacobian
         out = {}
         for b in (b for b in weights if b in self.asked):
-            others = [columns[o] * w[:, None] for o, w in weights.items() if o != b]
+            others = [begun[o][:, : len(runs)] * w[:, None] for o, w in weights.items() if o != b]
             own = triangle_of(np.concatenate(others)) if others else np.zeros((0, len(runs)))
-            problem = _Beside(self.here, there, b, own, self.told)
+            problem = _Beside(self.here, there, b, own, told=self.told, begun=begun[b])
             names = problem.names
             start = problem.start
             clear = not balances.has_gap and self.clear_of_noise
@@ -243,6 +243,8 @@ class _Beside:
         What the other balances of the other records lose.
     told : (unknowns, unknowns) array
         As :class:`LeftOpen` has it.
+    begun : (rows, unknowns) array
+        Derivative of the rows of the balance at the values of the fit.
     """
 
     here: WeakForm
@@ -250,6 +252,7 @@ class _Beside:
     balance: str
     own: FloatArray
     told: FloatArray
+    begun: FloatArray
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -295,7 +298,11 @@ class _Beside:
 
     def columns(self, x: FloatArray) -> FloatArray:
         """Its weighted derivative, (rows, unknowns)."""
-        found = self.there.stacked(x[: len(self.there.free)]).jacobian[self.balance]
+        own = slice(len(self.there.free))
+        if np.array_equal(x[own], self.start[own]):
+            found = self.begun
+        else:
+            found = self.there.stacked(x[own]).jacobian[self.balance]
         out = np.zeros((len(found), len(self.names)))
         out[:, : found.shape[1]] = found * np.atleast_1d(self.there.weights[self.balance])[:, None]
         return out

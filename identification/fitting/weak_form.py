@@ -162,7 +162,7 @@ class WeakForm:
         """Residual and Jacobian of every balance, unweighted, columns of `free`."""
         values = self.at(x)
         found = stack(self.balances, self.data.train, values, self.free)
-        jacobian = {b: np.array(j) for b, j in found.jacobian.items()}
+        jacobian = found.jacobian
         for n in memory_shapes_of(self.balances.model, self.free):
             step = NUMERIC_STEP * values[n]
             moved = stack(self._bare, self.data.train, {**values, n: values[n] + step}).residual
