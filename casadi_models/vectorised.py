@@ -70,6 +70,18 @@ CHUNK: Final = 16384
 """Points evaluated at a time, so that the intermediate arrays stay in the cache."""
 
 
+def _is_rows(argument: Any) -> bool:
+    """Whether an argument is given as its rows."""
+    return isinstance(argument, tuple) and any(np.ndim(row) for row in argument)
+
+
+def _of_part(argument: Any, part: slice) -> Any:
+    """An argument at some of the points."""
+    if isinstance(argument, tuple):
+        return [row[part] for row in argument]
+    return argument if argument.ndim == 1 else argument[:, part]
+
+
 @final
 class Vectorised:
     """A CasADi SX function with vector inputs, evaluated on arrays of points.
@@ -110,24 +122,26 @@ class Vectorised:
         ----------
         points : int
         *arguments : (size,) or (size, points) array per input
+            Or a tuple of such rows (points,), each where it is.
 
         Returns
         -------
         (size_out, points) array
         """
-        given = [np.asarray(a, dtype=np.float64) for a in arguments]
+        given = [a if _is_rows(a) else np.asarray(a, dtype=np.float64) for a in arguments]
         out = np.zeros((self.size_out, points))
         if not self.size_out:
             return out
         if not self._supported:
-            return np.array(self._function(*given)).reshape(self.size_out, points)
+            whole = [np.stack(a) if isinstance(a, tuple) else a for a in given]
+            return np.array(self._function(*whole)).reshape(self.size_out, points)
         with np.errstate(all="ignore"):
             for first in range(0, points, CHUNK):
                 part = slice(first, min(first + CHUNK, points))
-                self._run([a if a.ndim == 1 else a[:, part] for a in given], out[:, part])
+                self._run([_of_part(a, part) for a in given], out[:, part])
         return out
 
-    def _run(self, given: list[FloatArray], out: FloatArray) -> None:
+    def _run(self, given: list[Any], out: FloatArray) -> None:
         work: list[Any] = [0.0] * (self._work + 1)
         for kind, what, inputs, outputs in self._program:
             if kind == 4:

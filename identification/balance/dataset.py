@@ -231,7 +231,12 @@ def load_dataset(
     for number, record in enumerate((*train, *held_out)):
         way = partial(_once, curved=model.lagging_load, late=places_of(model))
         again.append(partial(way, record, joint, sensing, length, first))
-        prepared.append(again[-1](known=None if late is None else late[number]))
+        prepared.append(
+            again[-1](
+                known=None if late is None else late[number],
+                before=None if told is None else (*told.train, *told.held_out)[number],
+            )
+        )
         first = max(first, 1 + int(prepared[-1].block.max(initial=first - 1)))
     for number, (record, made) in enumerate(zip((*train, *held_out), prepared, strict=True)):
         seen = {p: [w.filters[p] for w in prepared[:count] if p in w.filters] for p in made.filters}
@@ -311,6 +316,7 @@ def _once(
     curved: bool,
     late: Sequence[str],
     known: Mapping[str, float] | None,
+    before: WeakRecord | None = None,
 ) -> WeakRecord:
     """:func:`weak_record` by its name, prepared once for the verbs that follow each other on a
     record.
@@ -318,7 +324,15 @@ def _once(
 
     def make() -> tuple[WeakRecord, int]:
         made = weak_record(
-            record, joint, sensing, length, first_block, curved=curved, late=late, known=known
+            record,
+            joint,
+            sensing,
+            length,
+            first_block,
+            curved=curved,
+            late=late,
+            known=known,
+            before=before,
         )
         tables = (made.averaged, made.points, made.smooth, made.curved, made.paired, *made.doubts)
         return replace(made, name=run_name(record)), sum(
@@ -383,9 +397,11 @@ def weak_record(
     curved: bool = False,
     late: Sequence[str] = (),
     known: Mapping[str, float] | None = None,
+    before: WeakRecord | None = None,
 ) -> WeakRecord:
     """One record, resampled to uniform time where needed, averaged with the kernel; the channels
-    of the places `late` are shifted where they are late (`known`: by these times [s]).
+    of the places `late` are shifted where they are late (`known`: by these times [s]). `before` is
+    the same record at another kernel: its points are taken over where they are the same.
     """
     noise = measured_sources(record, joint, sensing)
     record = evened(record)
@@ -403,12 +419,17 @@ def weak_record(
     }
     torsion = torsion_kernel(signals, segments, record.dt, pointwise, noise)
 
-    last: list[tuple[Mapping[str, float], WeakRecord]] = []
+    mended = {c: signals[c] for c in TOLD_BY if c in signals and signals[c] is not read[c]}
+    last = [] if before is None else [before]
 
     def made_with(shifts: Mapping[str, float]) -> WeakRecord:
         moved, parts = shifted(signals, segments, shifts)
-        known, before = last.pop() if last else ({}, None)
-        changed = {SIGNAL[p] for p in {*shifts, *known} if shifts.get(p, 0.0) != known.get(p, 0.0)}
+        times = {p: k * record.dt for p, k in shifts.items()}
+        before = last.pop() if last else None
+        was = {} if before is None else before.shifts
+        changed = {SIGNAL[p] for p in {*times, *was} if times.get(p, 0.0) != was.get(p, 0.0)}
+        # a torque that was mended is another one in every round of that
+        changed |= set(mended)
         made = prepare(
             record.time,
             moved,
@@ -431,10 +452,10 @@ def weak_record(
             )
         made = replace(
             made,
-            shifts={p: k * record.dt for p, k in shifts.items()},
+            shifts=times,
             doubts=doubts_of(made.grid, moved, noise),
         )
-        last.append((dict(shifts), made))
+        last.append(made)
         return made
 
     def spread(heard: WeakRecord, length: float, place: str, lateness: float) -> float:
@@ -457,7 +478,6 @@ def weak_record(
             if late
             else made_with({})
         )
-    mended = {c: signals[c] for c in TOLD_BY if c in signals and signals[c] is not read[c]}
     if mended:
         shifts = {p: k / record.dt for p, k in made.shifts.items()}
 

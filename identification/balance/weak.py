@@ -199,6 +199,11 @@ class Grid:
         """Standard deviation of the pointwise velocity of that position under its noise [1/s]."""
         return noise.after(kernel(self.pointwise[source], self.dt, 1), self.dt)
 
+    def has_points_of(self, other: Grid, source: str) -> bool:
+        """Whether the points of a measured signal are those of another grid."""
+        own, theirs = ((g.segments, g.dt, g.step, g.pointwise.get(source)) for g in (self, other))
+        return own == theirs
+
     def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
         """Rows of a correlation of a full-rate signal with kernel weights."""
         return _strided(values, weights, self.segments, self.half, self.stride)
@@ -427,22 +432,25 @@ class WeakRecord:
         """Sparse matrix (rows, points) of the rate of the kernel average."""
         return self._sparse(1)
 
-    def table(self, names: tuple[str, ...]) -> FloatArray:
-        """Signals at the points as rows in the order of `names`, zeros where one is not there;
-        made once, not to be written to.
+    def table(self, names: tuple[str, ...]) -> tuple[FloatArray, ...]:
+        """Signals at the points, (points,) each, in the order of `names`, zeros where one is not
+        there; not to be written to. No copies: they are several for every sample.
         """
-        return self._table("points", names, self.points, int(self.starts[-1]))
+        nothing = np.broadcast_to(0.0, (int(self.starts[-1]),))
+        return tuple(self.points.get(name, nothing) for name in names)
 
     def means(self, names: tuple[str, ...]) -> FloatArray:
-        """Averages of the signals as columns, as :meth:`table`."""
-        return self._table("averaged", names, self.averaged, self.rows, columns=True)
+        """Averages of the signals as columns in the order of `names`, zeros where one is not there;
+        made once, not to be written to.
+        """
+        return self._table("averaged", names, self.averaged)
 
     def bends(self, names: tuple[str, ...]) -> FloatArray:
-        """Second derivatives of these averages as columns, as :meth:`table`."""
-        return self._table("curved", names, self.curved, self.rows, columns=True)
+        """Second derivatives of these averages, as :meth:`means`."""
+        return self._table("curved", names, self.curved)
 
     def tilts(self, names: tuple[str, ...]) -> FloatArray:
-        """Rates of these averages as columns, as :meth:`table`."""
+        """Rates of these averages, as :meth:`means`."""
         rates: dict[str, FloatArray] = {}
         for source, chain in POSITION_CHAINS.items():
             if source not in self.averaged:
@@ -453,23 +461,17 @@ class WeakRecord:
             rates.update(zip(chain, (self.averaged[n] for n in chain[1:]), strict=False))
             if chain[-2] in self.curved:  # the rate of the last one
                 rates[chain[-1]] = self.curved[chain[-2]]
-        return self._table("tilted", names, rates, self.rows, columns=True)
+        return self._table("tilted", names, rates)
 
     def _table(
-        self,
-        kind: str,
-        names: tuple[str, ...],
-        signals: Mapping[str, FloatArray],
-        count: int,
-        *,
-        columns: bool = False,
+        self, kind: str, names: tuple[str, ...], signals: Mapping[str, FloatArray]
     ) -> FloatArray:
         if (kind, names) not in self._tables:
-            out = np.zeros((len(names), count))
+            out = np.zeros((self.rows, len(names)))
             for i, name in enumerate(names):
                 if name in signals:
-                    out[i] = signals[name]
-            self._tables[kind, names] = np.ascontiguousarray(out.T) if columns else out
+                    out[:, i] = signals[name]
+            self._tables[kind, names] = out
         return self._tables[kind, names]
 
     @cached_property
@@ -559,8 +561,9 @@ def prepare(
     curved : bool
         Second derivatives of the averages too.
     before : WeakRecord, optional
-        Made of the same record with some signals moved: where the rows are the same, those of the
-        signals `same` are taken over.
+        Made of the same record with some signals moved or at another kernel: where the rows are
+        the same, those of the signals `same` are taken over, and where the points are the same,
+        these.
     same : collection of str
         Signals that are as they were in `before`.
     readings : mapping, optional
@@ -594,15 +597,17 @@ def prepare(
         torsion=torsion,
     )
     over = set(same) if before is not None and before.grid == grid else set[str]()
-    found = filtered(grid, {n: x for n, x in signals.items() if n not in over}, curved=curved)
+    known = {n for n in same if before is not None and before.grid.has_points_of(grid, n)}
+    found = filtered(
+        grid, {n: x for n, x in signals.items() if n not in over}, curved=curved, known=known
+    )
     averaged, points, smooth, bent = found
     if before is not None:
-        for name in (n for source in over & set(POSITION_CHAINS) for n in POSITION_CHAINS[source]):
-            for own, old in zip(
-                found, (before.averaged, before.points, before.smooth, before.curved), strict=True
-            ):
-                if name in old:
-                    own[name] = old[name]
+        tables = (before.averaged, before.points, before.smooth, before.curved)
+        for source in (over | known) & set(POSITION_CHAINS):
+            taken = zip(found, tables, strict=True)
+            for own, old in taken if source in over else list(taken)[1:3]:
+                own.update({n: old[n] for n in POSITION_CHAINS[source] if n in old})
     for name, values in (("temperature", signals.get("temperature")), ("time", time)):
         if values is not None:
             averaged[name] = grid.correlate(values, differentiated_kernel(length, dt, 0))
@@ -636,7 +641,9 @@ def prepare(
         starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         curved=bent,
         between=between,
-        paired=paired(grid, signals),
+        paired=dict(before.paired)
+        if before is not None and known >= set(PAIR) and before.grid.torsion == grid.torsion
+        else paired(grid, signals),
     )
 
 
@@ -656,7 +663,11 @@ def paired(grid: Grid, signals: Mapping[str, FloatArray]) -> dict[str, FloatArra
 
 
 def filtered(
-    grid: Grid, signals: Mapping[str, FloatArray], *, curved: bool = False
+    grid: Grid,
+    signals: Mapping[str, FloatArray],
+    *,
+    curved: bool = False,
+    known: Collection[str] = (),
 ) -> tuple[
     dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]
 ]:
@@ -669,6 +680,8 @@ def filtered(
         Keys of :data:`POSITION_CHAINS`, full rate; other keys are left out.
     curved : bool
         Second derivatives of the averages too.
+    known : collection of str
+        Signals whose points are not wanted.
 
     Returns
     -------
@@ -691,9 +704,10 @@ def filtered(
                 bent[name] = grid.correlate(
                     signals[source], differentiated_kernel(length, dt, order + 2)
                 )
-            points[name], smooth[name] = _pointwise(
-                signals[source], grid.segments, short[source], dt, order, grid.step
-            )
+            if source not in known:
+                points[name], smooth[name] = _pointwise(
+                    signals[source], grid.segments, short[source], dt, order, grid.step
+                )
     return averaged, points, smooth, bent
 
 

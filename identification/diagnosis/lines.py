@@ -367,16 +367,12 @@ class _Pointwise:
         """Residual (n,), or columns (n, wrt), of every balance at the samples."""
         p = np.array([float(values[n]) for n in self.names])
         count = len(rows.time)
-        matrix = np.zeros((len(Signals.names()), count))
-        for i, name in enumerate(Signals.names()):
-            if name in rows.points:
-                matrix[i] = rows.points[name]
         memory = (
             self._memory.along(rows, p)
             if self._memory is not None
             else np.zeros((self._states, count))
         )
-        full = self._f(count, matrix, memory, p)
+        full = self._f(count, rows.table(Signals.names()), memory, p)
         width = max(len(self.wrt), 1)
         return {
             b: full[i] if not self.wrt else full[i * width : (i + 1) * width].T
