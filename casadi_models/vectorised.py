@@ -6,7 +6,7 @@ virtual-machine step per instruction and point.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, final
 
 import casadi as ca
@@ -128,18 +128,30 @@ class Vectorised:
         -------
         (size_out, points) array
         """
-        given = [a if _is_rows(a) else np.asarray(a, dtype=np.float64) for a in arguments]
         out = np.zeros((self.size_out, points))
+        self._fill(out, arguments)
+        return out
+
+    def by_point(self, points: int, *arguments: Any) -> FloatArray:
+        """As a call, the outputs of each point beside each other: shape (points, size_out)."""
+        out = np.zeros((points, self.size_out))
+        self._fill(out.T, arguments)
+        return out
+
+    def _fill(self, out: FloatArray, arguments: Sequence[Any]) -> None:
+        """Write the outputs, (size_out, points)."""
         if not self.size_out:
-            return out
+            return
+        given = [a if _is_rows(a) else np.asarray(a, dtype=np.float64) for a in arguments]
         if not self._supported:
             whole = [np.stack(a) if isinstance(a, tuple) else a for a in given]
-            return np.array(self._function(*whole)).reshape(self.size_out, points)
+            out[:] = np.array(self._function(*whole)).reshape(out.shape)
+            return
+        points = out.shape[1]
         with np.errstate(all="ignore"):
             for first in range(0, points, CHUNK):
                 part = slice(first, min(first + CHUNK, points))
                 self._run([_of_part(a, part) for a in given], out[:, part])
-        return out
 
     def _run(self, given: list[Any], out: FloatArray) -> None:
         work: list[Any] = [0.0] * (self._work + 1)

@@ -188,7 +188,11 @@ class _Part:
         full: FloatArray = averaged @ np.array(self._linear(p)).T
         if self.needed:
             count = len(data.points["motor_position"])
-            full[:, self.needed] += average(self._rest(count, data.table(_NAMES), memory, p).T)
+            bent = average(self._rest.by_point(count, data.table(_NAMES), memory, p))
+            if len(self.needed) == full.shape[1]:
+                full += bent
+            else:
+                full[:, self.needed] += bent
         return full
 
     def slopes(self, balances: Sequence[str], p: Sequence[float]) -> dict[str, dict[str, float]]:
@@ -369,7 +373,7 @@ class Flight:
             return np.zeros(data.rows)
         count = len(data.points["motor_position"])
         memory = np.zeros((self._states, count))
-        return data.average(self._gap(count, data.table(_NAMES), memory, p).T)[:, 0]
+        return data.average(self._gap.by_point(count, data.table(_NAMES), memory, p))[:, 0]
 
 
 _KEPT: Final = 512

@@ -186,6 +186,8 @@ def _all_there(measured: npt.NDArray[np.bool_], m: int) -> npt.NDArray[np.bool_]
 
 def _clear(jumps: FloatArray, length: int) -> npt.NDArray[np.bool_]:
     """Which stretches of so many steps hold no mark."""
+    if not jumps.any():
+        return np.ones(len(jumps) - length, dtype=np.bool_)
     total = np.concatenate([[0.0], np.cumsum(jumps)])
     return np.asarray(total[length + 1 :] == total[: -length - 1])
 
