@@ -6,6 +6,7 @@ linear combination of the motion, and of free curves.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
@@ -38,6 +39,9 @@ ROUNDING: Final = 1e-10
 """Share of the largest direction of the columns that rounding over thousands of rows can make."""
 AT_A_TIME: Final = 2048
 """Rows multiplied or turned at a time: with a hundred columns they stay in the cache."""
+TOLD_BY_PRODUCTS: Final = 1e-8
+"""Share of the largest of the powers of directions from which products of columns tell one: to half
+of their digits."""
 HALVINGS: Final = 6
 """Further nodes over a velocity on either side of zero, each at half of the one before: what
 friction does in slow motion, a Stribeck curve or its turn over a few mrad/s, is over before a share
@@ -138,7 +142,7 @@ class Basis:
     def of(cls, columns: Sequence[FloatArray]) -> Basis:
         """Of columns, (rows,) or (rows, k) each."""
         basis = independent(columns)
-        return cls(basis, _products(basis))
+        return cls(basis, _products([basis]))
 
     def rest(
         self,
@@ -153,7 +157,7 @@ class Basis:
         def beside(weight: FloatArray) -> FloatArray:
             # most rows count whole: what the others lack is taken off
             less = np.flatnonzero(weight != 1.0)
-            lacking = _products(self.columns, less, 1.0 - weight[less])
+            lacking = _products([self.columns], less, 1.0 - weight[less])
             seen = (weight * values) @ self.columns
             solution, *_ = np.linalg.lstsq(self.products - lacking, seen, rcond=None)
             return np.asarray(values - self.columns @ solution)
@@ -176,19 +180,32 @@ class Basis:
 def independent(columns: Sequence[FloatArray], weight: FloatArray | None = None) -> FloatArray:
     """Columns (rows, any) that span the same as those given, (rows,) or (rows, k) each, but for
     directions that rounding makes; orthonormal where each row counts by its weight (rows,).
+
+    By the products of the columns as far as these tell: their digits are half of those of the
+    columns. What is left of the smaller directions beside the others is taken apart itself.
     """
-    count = len(columns[0])
-    triangle = np.empty((0, sum(x[:1].size for x in columns)))
-    for rows in _in_turn(count):
-        part = np.column_stack([x[rows] for x in columns])
-        part = part if weight is None else part * np.sqrt(weight[rows])[:, None]
-        triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, part]), mode="r"))
-    size = np.maximum(np.linalg.norm(triangle, axis=0), 1e-300)
-    _, sizes, directions = np.linalg.svd(triangle / size, full_matrices=False)
-    kept = sizes > ROUNDING * sizes[0]
-    turn = directions[kept].T / sizes[kept] / size[:, None]
-    out = np.empty((count, turn.shape[1]))
-    for rows in _in_turn(count):
+    products = _products(columns, weight=weight)
+    size = np.sqrt(np.diag(products))
+    size = np.where(size > 0, size, 1.0)
+    powers, turn = np.linalg.eigh(products / size / size[:, None])
+    sure = powers > TOLD_BY_PRODUCTS * powers[-1]
+    turn /= size[:, None]
+    first, rest = turn[:, sure] / np.sqrt(powers[sure]), turn[:, ~sure]
+    if rest.shape[1]:
+        for _ in range(2):  # twice: the first time leaves what rounding makes of the others
+            rest = rest - first @ (first.T @ products @ rest)
+        small = _turned(columns, rest)
+        left = small if weight is None else small * np.sqrt(weight)[:, None]
+        _, sizes, directions = np.linalg.svd(np.linalg.qr(left, mode="r"), full_matrices=False)
+        kept = sizes > ROUNDING * math.sqrt(powers[-1])
+        rest = rest @ (directions[kept].T / sizes[kept])
+    return _turned(columns, np.column_stack([first, rest]))
+
+
+def _turned(columns: Sequence[FloatArray], turn: FloatArray) -> FloatArray:
+    """Columns times a matrix (k, any)."""
+    out = np.empty((len(columns[0]), turn.shape[1]))
+    for rows in _in_turn(len(out)):
         np.matmul(np.column_stack([x[rows] for x in columns]), turn, out=out[rows])
     return out
 
@@ -199,15 +216,19 @@ def _in_turn(count: int) -> list[slice]:
 
 
 def _products(
-    columns: FloatArray, rows: IntArray | None = None, weight: FloatArray | None = None
+    columns: Sequence[FloatArray],
+    rows: IntArray | None = None,
+    weight: FloatArray | None = None,
 ) -> FloatArray:
-    """Products (k, k) of columns (rows, k): of all rows, or of some that count by a weight."""
-    out = np.zeros((columns.shape[1],) * 2)
-    for part in _in_turn(len(columns) if rows is None else len(rows)):
-        seen = columns[part if rows is None else rows[part]]
+    """Products (k, k) of columns, (rows,) or (rows, k) each: of all rows, or of some that count by
+    a weight.
+    """
+    out: FloatArray | float = 0.0
+    for part in _in_turn(len(columns[0]) if rows is None else len(rows)):
+        seen = np.column_stack([x[part if rows is None else rows[part]] for x in columns])
         seen = seen if weight is None else seen * np.sqrt(weight[part])[:, None]
-        out += seen.T @ seen
-    return out
+        out = out + seen.T @ seen
+    return np.asarray(out)
 
 
 def bounded(x: FloatArray) -> FloatArray:

@@ -31,6 +31,7 @@ from identification.balance.beside import (
     scaled,
 )
 from identification.balance.colour import LEVEL_ERROR
+from identification.balance.memory import MOST, NUMBERS, cache_of
 from identification.balance.weak import Filter, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]
@@ -442,9 +443,16 @@ def steady(record: WeakRecord) -> npt.NDArray[np.bool_]:
     """Rows within which the joint neither turns nor creeps, shape (rows,): what is no law of the
     model yet has its rates in a Stribeck curve, too. All rows where hardly any is such a row.
     """
-    v = record.points["motor_velocity"]
-    creeps = np.abs(v) < CREEP * np.quantile(np.abs(v), FAST)
-    return _within(record, np.where(creeps, 0.0, np.sign(v)))
+
+    def make() -> tuple[npt.NDArray[np.bool_], int]:
+        v = record.points["motor_velocity"]
+        creeps = np.abs(v) < CREEP * np.quantile(np.abs(v), FAST)
+        found = _within(record, np.where(creeps, 0.0, np.sign(v)))
+        found.flags.writeable = False
+        return found, record.rows
+
+    found: npt.NDArray[np.bool_] = cache_of("steady").get(record, None, make, MOST)
+    return found
 
 
 def _within(record: WeakRecord, way: FloatArray) -> npt.NDArray[np.bool_]:
@@ -468,6 +476,18 @@ def lateness(
     large for it. Read through the motion of the motor (two-stage least squares) it is not, but
     known less well; so that is taken where the two are certainly unlike (Hausman 1978).
     """
+
+    def make() -> tuple[tuple[float, float, float], int]:
+        return _lateness(made, place, torque=torque, by_motor=by_motor), 1
+
+    law = (place, torque, by_motor)
+    found: tuple[float, float, float] = cache_of("lateness").get(made, law, make, NUMBERS)
+    return found
+
+
+def _lateness(
+    made: WeakRecord, place: str, *, torque: bool, by_motor: bool
+) -> tuple[float, float, float]:
     kept = steady(made)
     a = {n: x[kept] for n, x in made.averaged.items()}
     if place not in ENCODERS:

@@ -138,17 +138,19 @@ def spaced_levels(
     """
     elsewhere = np.zeros(len(values)) if calm is None else (~calm).astype(np.float64)
     jumps = elsewhere.copy()
+    before = {s.start: _marks_before(elsewhere[s]) for s in segments}
     _mark(jumps, values, segments, 1, JUMP * level)
     out = []
     for spacing in spacings:
         of_use, left = 0, [np.empty(0)]
         for s in segments:
             if s.stop - s.start > 8 * spacing:
-                usable = _clear(elsewhere[s], 4 * spacing)
+                usable = _clear(before[s.start], 4 * spacing)
                 if measured is not None:
                     usable = usable & _all_there(measured[s], spacing)
                 of_use += int(usable.sum())
-                left.append(_spaced(values[s], spacing)[usable & _clear(jumps[s], 4 * spacing)])
+                own = usable & _clear(_marks_before(jumps[s]), 4 * spacing)
+                left.append(_spaced(values[s], spacing)[own])
         squares = np.concatenate(left) ** 2
         if len(squares) < max(FEWEST_LEFT * of_use, FEWEST_READ):
             break
@@ -184,12 +186,14 @@ def _all_there(measured: npt.NDArray[np.bool_], m: int) -> npt.NDArray[np.bool_]
     return np.asarray(np.all([measured[k * m : k * m + count] for k in range(5)], axis=0))
 
 
-def _clear(jumps: FloatArray, length: int) -> npt.NDArray[np.bool_]:
-    """Which stretches of so many steps hold no mark."""
-    if not jumps.any():
-        return np.ones(len(jumps) - length, dtype=np.bool_)
-    total = np.concatenate([[0.0], np.cumsum(jumps)])
-    return np.asarray(total[length + 1 :] == total[: -length - 1])
+def _marks_before(jumps: FloatArray) -> FloatArray:
+    """Sum of the marks before each sample and at the end."""
+    return np.concatenate([[0.0], np.cumsum(jumps)]) if jumps.any() else np.zeros(len(jumps) + 1)
+
+
+def _clear(before: FloatArray, length: int) -> npt.NDArray[np.bool_]:
+    """Which stretches of so many steps hold no mark, from the marks before each sample."""
+    return np.asarray(before[length + 1 :] == before[: -length - 1])
 
 
 _LEVELS: Final[WeakKeyDictionary[Record, dict[tuple[str, float], ChannelNoise]]] = (

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Final, final
 
@@ -274,11 +275,15 @@ class Record:
 
     def segments(self) -> list[slice]:
         """Contiguous stretches, one slice each, in order."""
+        return list(self._segments)
+
+    @cached_property
+    def _segments(self) -> tuple[slice, ...]:
         if len(self) == 0:
-            return []
+            return ()
         cuts = np.flatnonzero(np.diff(self.segment)) + 1
         edges = [0, *cuts.tolist(), len(self)]
-        return [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return tuple(slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True))
 
     def steps(self) -> FloatArray:
         """Time steps within segments [s], concatenated; at most n - 1."""
@@ -286,7 +291,7 @@ class Record:
         result: FloatArray = np.diff(self.time)[inside]
         return result
 
-    @property
+    @cached_property
     def dt(self) -> float:
         """Median time step within segments [s]; NaN where there is none."""
         steps = self.steps()
