@@ -70,6 +70,8 @@ rest lie above.
 """
 NANOSECOND: Final = 1e-9
 """What two shifts may differ by and be the same [s]: no stamp is finer."""
+DIGITS: Final = 9
+"""Of a shift in samples: those that a time in seconds gives again."""
 PREPARED: Final = 16_000_000
 """Values of prepared records that a thread keeps (128 MB): two records of 40 s at 1 kHz at every
 kernel of the verdict.
@@ -423,6 +425,8 @@ def weak_record(
     last = [] if before is None else [before]
 
     def made_with(shifts: Mapping[str, float]) -> WeakRecord:
+        # found here in samples or told again in seconds: the same shift is the same number
+        shifts = {p: round(k, DIGITS) for p, k in shifts.items()}
         moved, parts = shifted(signals, segments, shifts)
         times = {p: k * record.dt for p, k in shifts.items()}
         before = last.pop() if last else None
@@ -464,7 +468,7 @@ def weak_record(
         return own.after(plain + lateness * rate, record.dt) ** 2
 
     if known is not None:
-        made = made_with({p: round(k / record.dt, 9) for p, k in known.items()})
+        made = made_with({p: k / record.dt for p, k in known.items()})
     else:
         made = (
             in_time(
