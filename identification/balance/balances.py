@@ -13,12 +13,10 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models import JointModel
+from casadi_models import JointModel, Signals
 from casadi_models.affine import AffineParts
 from casadi_models.equations import swept
 from casadi_models.vectorised import Vectorised
-from identification.balance.corners import NAMES as _NAMES
-from identification.balance.corners import Friction, with_corners
 from identification.balance.kinematic import kinematic_law
 from identification.balance.memory import Law, residuals_of, states_of
 from identification.balance.sensing import Sensing
@@ -27,6 +25,7 @@ from identification.balance.weak import PAIR, WeakRecord
 FloatArray = npt.NDArray[np.float64]
 Expression = Any
 
+_NAMES: Final = Signals.names()
 
 UNROLLED: Final = 200
 """Steps of a memory law in one compiled stretch."""
@@ -259,11 +258,6 @@ class Balances:
         self.law = Law(model.structure, sensing, columns_only)
 
     @cached_property
-    def friction(self) -> Friction:
-        """What holds each side against its motion."""
-        return Friction(self.model)
-
-    @cached_property
     def holding(self) -> frozenset[str]:
         """Parameters that stand in a balance: what stands in none moves nothing, whatever its
         value.
@@ -287,27 +281,19 @@ class Balances:
         return states_of(data, law, lambda: memory.along(data, p))
 
     def evaluate(
-        self,
-        data: WeakRecord,
-        values: Mapping[str, float],
-        remembered: WeakRecord | None = None,
-        about: Mapping[str, float] | None = None,
+        self, data: WeakRecord, values: Mapping[str, float], remembered: WeakRecord | None = None
     ) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Residual (rows,) and Jacobian (rows, wrt) of every balance at the given parameter values.
 
         `remembered` is a record with the same smoothed positions, whose internal states may be
-        known already. `about` are the values whose friction and inertia give the velocities their
-        corners, where these shall not move with the parameters: the Jacobian takes them as given.
+        known already.
         """
         p = tuple(float(values[n]) for n in self.names)
-        at = values if about is None else about
-        friction = balances_of(self.model, self.sensing, wrt=()).friction
-        cornered = with_corners(data, friction, self.sensing, at)
 
         def rows() -> FloatArray:
-            return self._rows(cornered, self.memory_values(remembered or data, values), p)
+            return self._rows(data, self.memory_values(remembered or data, values), p)
 
-        full = rows() if self.wrt else residuals_of(cornered, (self.law, p), rows)
+        full = rows() if self.wrt else residuals_of(data, (self.law, p), rows)
         width = 1 + len(self.wrt)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])

@@ -25,12 +25,13 @@ from identification.balance.clocks import (
     shifted,
 )
 from identification.balance.colour import ChannelNoise, Part, white
+from identification.balance.contacts import TOLD_BY, restored
 from identification.balance.drawn_noise import doubts_of
 from identification.balance.memory import cache_of
 from identification.balance.noise import noise_of
 from identification.balance.sensing import Sensing, adapt, check_alike, sense, signals_of
 from identification.balance.slow_noise import SlowNoise, drifts_of, power_of, slow_noise_of
-from identification.balance.spikes import TOLD_BY, restored, without_spikes
+from identification.balance.spikes import without_spikes
 from identification.balance.stamps import bridge_errors, evened
 from identification.balance.weak import (
     CLAIM_KERNEL,
@@ -49,7 +50,6 @@ from identification.data.record import Record
 from identification.errors import InputError
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 HOLD_DELAY: Final = hold.HOLD_DELAY
 HOLD_NAME: Final = hold.HOLD_NAME
@@ -519,8 +519,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
     stand still and an encoder reads in steps, the rows have one reading in all of the twist.
     """
     out: dict[str, FloatArray] = {}
-    stills: dict[str, FloatArray] = {}
-    apart = made.grid.step * made.grid.dt
+    stills: list[FloatArray] = []
     smooth, paired = dict(made.smooth), dict(made.paired)
     doubts = tuple(dict(d) for d in made.doubts)
     for side in ("motor", "link"):
@@ -529,7 +528,7 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
             continue
         still_speed = STILL * made.grid.velocity_noise(source, noise[source])
         slow = np.abs(made.points[f"{side}_velocity"]) <= still_speed
-        shortest = max(1, whole(made.grid.pointwise[source] / apart))
+        shortest = max(1, whole(made.grid.pointwise[source] / (made.grid.step * made.grid.dt)))
         still = np.zeros(len(slow))
         tables = [t for t in (smooth, paired, *doubts) if source in t]
         for t in tables:
@@ -544,29 +543,12 @@ def _with_rests(made: WeakRecord, noise: Mapping[str, ChannelNoise]) -> WeakReco
                         held = t[source]
                         held[rows] = np.linspace(held[rows.start], held[rows.stop - 1], end - begin)
         out[side] = made.average(still) if still.any() else np.zeros(made.rows)
-        stills[side] = still
+        stills.append(still)
     if len(stills) == 2:
-        both = stills["motor"] * stills["link"]
+        both = stills[0] * stills[1]
         if both.any() and any(noise[c].step > 0 for c in PAIR):
             out[HELD_READINGS] = made.average(both)
-    closed = {
-        side: _closed(x, made.starts, made.grid.pointwise[f"{side}_position"] / apart)
-        for side, x in stills.items()
-    }
-    return replace(made, rest=out, still=closed, smooth=smooth, paired=paired, doubts=doubts)
-
-
-def _closed(still: FloatArray, starts: IntArray, shortest: float) -> FloatArray:
-    """Standstills (points,) joined over what lies between two of them for less points than a kernel
-    of the velocity has: nothing comes and goes in it, and it is their noise.
-    """
-    out = still.copy()
-    for first, last in zip(starts[:-1], starts[1:], strict=True):
-        edges = first + np.flatnonzero(np.diff(still[first:last])) + 1
-        for end, begin in zip(edges[:-1], edges[1:], strict=True):
-            if still[end - 1] and begin - end < shortest:
-                out[end:begin] = 1.0
-    return out
+    return replace(made, rest=out, smooth=smooth, paired=paired, doubts=doubts)
 
 
 def _loudness(noise: ChannelNoise) -> float:

@@ -90,8 +90,7 @@ def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Dra
         return found[1]
     rng = np.random.default_rng(SEED)
     seen, rows = excerpt(record)
-    # smoothed torques tell no corners; what noise does to a velocity is the same without
-    calm = replace(seen, points={**seen.points, **seen.smooth}, still={})
+    calm = replace(seen, points={**seen.points, **seen.smooth})
     made = tuple(
         Draw(seen, rows, calm, noisy=_with_noise(calm, noise, rng))
         for _ in range(max(1, -(-ROWS // max(seen.rows, 1))))
@@ -168,7 +167,6 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
         starts=np.concatenate([[0], np.cumsum([len(p) for p in points])]).astype(np.int64),
         curved=of(record.curved, which),
         rest=of(record.rest, which),
-        still=of(record.still, where),
         between=of(record.between, which),
         support=None if record.support is None else record.support[which],
         bridging=of(record.bridging, np.concatenate(samples_of)),

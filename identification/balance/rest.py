@@ -14,9 +14,8 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.balance.balances import balances_of
 from identification.balance.calibration import settled, values_on
-from identification.balance.corners import sticking_torque
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import floor_rows, rms
+from identification.balance.stacked import floor_rows, rms, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord
 
 FloatArray = npt.NDArray[np.float64]

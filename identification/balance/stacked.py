@@ -16,7 +16,6 @@ from casadi_models import JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, of_run, settled, values_on
 from identification.balance.colour import ChannelNoise, is_slow, white
-from identification.balance.corners import sticking_torque
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import LONGEST, draws_of
 from identification.balance.memory import Law, numbers_of
@@ -94,7 +93,6 @@ def stack(
     records: Sequence[WeakRecord],
     values: Mapping[str, float],
     names: Sequence[str] | None = None,
-    about: Mapping[str, float] | None = None,
 ) -> Stacked:
     """Evaluate the balances on records one after the other; rows that take no part are zero.
 
@@ -113,8 +111,7 @@ def stack(
     first = 0
     for w in records:
         rows = slice(first, first + w.rows)
-        found = balances.evaluate(w, values_on(model, w, values), about=about)
-        for b, (r, columns) in found.items():
+        for b, (r, columns) in balances.evaluate(w, values_on(model, w, values)).items():
             residual[b][rows] = r
             _fill(jacobian[b][rows], balances, w, columns, wanted)
         first += w.rows
@@ -709,6 +706,11 @@ def _between_samples(
             parts.append(np.sqrt(np.maximum(told**2 - (SURE_JUMP * noise) ** 2, 0.0) / 3))
         out.append(np.concatenate(parts) if parts else np.empty(0))
     return out
+
+
+def sticking_torque(model: JointModel, values: Mapping[str, float], place: str) -> float:
+    """Torque that dry friction of a side may hold at a standstill, in either direction [N.m]."""
+    return float(sum(abs(values[n]) for n in model.named("static", place)))
 
 
 def _either_direction(record: WeakRecord, place: str, noise: ChannelNoise) -> npt.NDArray[np.bool_]:

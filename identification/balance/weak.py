@@ -334,10 +334,6 @@ class WeakRecord:
         By the place of a late sensor, the samples that are taken off its readings already [s].
     filters : mapping of str to Filter
         By the place of a sensor that may be read through a low-pass, what the record says of it.
-    still : mapping of str to (points,) array
-        By side, 1 where it stands still and 0 elsewhere, of a record whose torques at the points
-        are as they were read: those tell the corners of its velocities
-        (:func:`identification.balance.corners.with_corners`).
     """
 
     grid: Grid
@@ -358,7 +354,6 @@ class WeakRecord:
     doubts: tuple[Mapping[str, FloatArray], ...] = ()
     bridging: Mapping[str, FloatArray] = field(default_factory=dict)
     filters: Mapping[str, Filter] = field(default_factory=dict)
-    still: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return one_line(self)

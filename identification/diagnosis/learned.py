@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.table import Table
-from identification.balance.corners import sticking_torque
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import references
+from identification.balance.stacked import references, sticking_torque
 from identification.data.joint_file import Correlation
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim

@@ -840,18 +840,6 @@ class Session:
         self._doubted.update(odds.behind)
         return trial, make_claim(trial, ranking, base, odds.names)
 
-    def _met_unseen(self, standing: _Standing, position: int) -> bool:
-        """Whether the training records hardly reverse, so that all they tell of friction stands in
-        a block or two, and held-out rows that lie beyond noise, and what the training rows leave
-        open, come down to it with a claim: what gains by chance does not.
-        """
-        if not few_reversals(self.data):
-            return False
-        balance = standing.claims[position].balance
-        steps = standing.steps[position : position + 2]
-        left, met = (self.bench.ratios(s)[balance].ratio for s in steps)
-        return met <= RATIO_LIMIT < left
-
     def _by_whole_fits(
         self, standing: _Standing, ranking: Ranking, base: Base, *, stale: bool, crowded: bool
     ) -> tuple[_Standing, Ranking, Base]:
@@ -888,8 +876,6 @@ class Session:
                 standing, stale = self._replay(others, standing), True
                 position -= 1
                 continue
-            if odds.empty and self._met_unseen(standing, position):
-                odds = odds.one_of_them
             if odds.empty and not needed:
                 self._refused[claim.label] = (
                     f"gains no more than laws that are not missing: nothing is {odds.nothing:.0%} "

@@ -275,32 +275,19 @@ def _fitted(
     )
     _check_moves(linear)
     values = {**linear.fitted(limits, 3)[0], **soft}
-    start_values = _best_start(balances, data, values, free, limits)
-
-    def passed(values: dict[str, float]) -> tuple[dict[str, float], int]:
-        used = 0
-        for number in range(GAP_PASSES if balances.has_gap else 2):
-            tell("first pass" if number == 0 else "second pass", 0.2 + 0.35 * min(number, 1))
-            began = values
-            sigma = _sigmas(model, data, values)
-            weights = row_weights(balances, data, values, sigma, data.train)
-            before = _beside(known_before, _independent(balances, data, values))
-            values, used = WeakForm(balances, data, values, tuple(free), weights, before).fitted(
-                limits, iterations
-            )
-            gaps = [n for n in free if n in shapes and values[n]]
-            if number and all(abs(values[n] / began[n] - 1) < SETTLED_GAP for n in gaps):
-                break
-        return values, used
-
-    values, used = passed(start_values)
-    flat = _flat(model, data, values, free)
-    if flat:
-        # from where a turn is sharp no step leads back to a wide one
-        wide = WIDE * data.ranges["velocity"]
-        other, steps = passed({**start_values, **dict.fromkeys(flat, wide)})
-        if _unlikely(balances, data, other) < _unlikely(balances, data, values):
-            values, used = other, steps
+    values = _best_start(balances, data, values, free, limits)
+    for number in range(GAP_PASSES if balances.has_gap else 2):
+        tell("first pass" if number == 0 else "second pass", 0.2 + 0.35 * min(number, 1))
+        began = values
+        sigma = _sigmas(model, data, values)
+        weights = row_weights(balances, data, values, sigma, data.train)
+        before = _beside(known_before, _independent(balances, data, values))
+        values, used = WeakForm(balances, data, values, tuple(free), weights, before).fitted(
+            limits, iterations
+        )
+        gaps = [n for n in free if n in shapes and values[n]]
+        if number and all(abs(values[n] / began[n] - 1) < SETTLED_GAP for n in gaps):
+            break
     sigma = _sigmas(model, data, values)
     weights = row_weights(balances, data, values, sigma, data.train)
     tell("standard errors", 0.9)
@@ -507,7 +494,11 @@ def _best_start(
     that went to nothing while another law was missing: rows no longer tell its size.
     """
     shaped = [t for t in balances.model.terms if t.effect.several_valleys]
-    flat = _flat(balances.model, data, values, free)
+    flat = [
+        n
+        for n in balances.model.named("smoothing")
+        if n in free and values[n] < FLAT * data.ranges["velocity"]
+    ]
     if not shaped and not flat:
         return values
     smooth = [n for t in shaped for n in balances.model.named("smoothing", t.place)]
@@ -561,34 +552,8 @@ def _best_start(
     return best[1] if best is not None else values
 
 
-def _flat(
-    model: JointModel, data: Dataset, values: Mapping[str, float], free: Sequence[str]
-) -> list[str]:
-    """Smoothing velocities of which no row tells the size."""
-    least = FLAT * data.ranges["velocity"]
-    return [n for n in model.named("smoothing") if n in free and values[n] < least]
-
-
-def _unlikely(balances: Balances, data: Dataset, values: Mapping[str, float]) -> float:
-    """Twice the negative logarithm of the likelihood of these values, each with the weights that
-    belong to it, but for a constant.
-    """
-    bare_ones = balances_of(balances.model, data.sensing, wrt=())
-    sigma = _sigmas(balances.model, data, values)
-    weights = row_weights(balances, data, values, sigma, data.train)
-    residual = stack(bare_ones, data.train, values).residual
-    taking = {b: taking_part(b, data.train) for b in residual}
-    return sum(
-        float(np.sum(((x * weights[b]) ** 2 - 2 * np.log(weights[b]))[taking[b]]))
-        for b, x in residual.items()
-    )
-
-
 SMOOTHING_SHARES: Final = (0.003, 0.01)
 """Smoothing velocities from which laws of low speed are fitted, as shares of the record's speed."""
-WIDE: Final = 0.03
-"""Another one, from where a fit is begun again that ended with a turn at once: friction that turns
-over more than that of a record's speed is seen from any start."""
 FLAT: Final = 1e-3
 """Smoothing velocity, in the same, under which no row tells its size: a turn is over between two of
 the points at which friction is evaluated.

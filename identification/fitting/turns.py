@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.balance.balances import Balances
-from identification.balance.corners import sticking_torque
-from identification.balance.stacked import TURN_SHARE, friction_rows
+from identification.balance.stacked import TURN_SHARE, friction_rows, sticking_torque
 from identification.balance.weak import RESTING_SIDES, WeakRecord, whole
 
 FloatArray = npt.NDArray[np.float64]

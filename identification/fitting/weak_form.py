@@ -16,7 +16,6 @@ from casadi_models.hold import CLOCKS
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare
 from identification.balance.clocks import one_way
-from identification.balance.corners import with_corners
 from identification.balance.dataset import Dataset
 from identification.balance.stacked import Stacked, stack
 from identification.fitting.least_squares import least_squares
@@ -162,41 +161,21 @@ class WeakForm:
     def stacked(self, x: FloatArray) -> Stacked:
         """Residual and Jacobian of every balance, unweighted, columns of `free`."""
         values = self.at(x)
-        found = stack(self.balances, self.data.train, values, self.free, self._about(values))
+        found = stack(self.balances, self.data.train, values, self.free)
         jacobian = found.jacobian
-        for n in (*memory_shapes_of(self.balances.model, self.free), *self.turning):
+        for n in memory_shapes_of(self.balances.model, self.free):
             step = NUMERIC_STEP * values[n]
-            moved = self._residual({**values, n: values[n] + step})
+            moved = stack(self._bare, self.data.train, {**values, n: values[n] + step}).residual
             for b in jacobian:
                 jacobian[b][:, self.free.index(n)] = (moved[b] - found.residual[b]) / step
         return Stacked(self._beside(found.residual), jacobian, found.block, found.taking)
-
-    def _residual(self, values: Mapping[str, float]) -> Mapping[str, FloatArray]:
-        return stack(self._bare, self.data.train, values, about=self._about(values)).residual
-
-    def _about(self, values: Mapping[str, float]) -> Mapping[str, float]:
-        """Values whose friction makes the corners of the velocities: as it was at the beginning,
-        but for how wide its turn is, on which they hang most.
-        """
-        return {**self.values, **{n: values[n] for n in self.balances.model.named("smoothing")}}
-
-    @cached_property
-    def turning(self) -> tuple[str, ...]:
-        """Smoothing velocities that are free where velocities have corners."""
-        model = self.balances.model
-        cornered = (
-            with_corners(w, self._bare.friction, self.data.sensing, self.values) is not w
-            for w in self.data.train
-        )
-        free = [n for n in model.named("smoothing") if n in self.free and self.values[n] > 0]
-        return tuple(free) if free and any(cornered) else ()
 
     def _beside(self, residual: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         return {b: r - self.left[b] if b in self.left else r for b, r in residual.items()}
 
     def residual(self, x: FloatArray) -> FloatArray:
         """Weighted rows, one balance after the other, then those of the prior."""
-        rows = self._beside(self._residual(self.at(x)))
+        rows = self._beside(stack(self._bare, self.data.train, self.at(x)).residual)
         return np.concatenate(
             [*(rows[b] * self.weights[b] for b in self.balances.balances), self.surprise(x)]
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, final
 
@@ -58,13 +58,6 @@ class Odds:
         gains is no more than laws that are not missing gain on the same records.
         """
         return self.nothing > sum(self.probability.values())
-
-    @property
-    def one_of_them(self) -> Odds:
-        """The same where something is missing for certain."""
-        left = sum(self.probability.values())
-        chance = {n: p / left for n, p in self.probability.items()} if left > 0 else {}
-        return replace(self, probability=MappingProxyType(chance), nothing=0.0)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -99,8 +99,6 @@ def unbiased(
     )
     x = np.array([problem.values[n] for n in problem.free])
     moves = ((x > bounds[0]) & (x < bounds[1])) | ~problem.bent
-    # how wide a turn is, only rows tell whose instants are known
-    moves &= np.array([n not in problem.turning for n in problem.free], dtype=bool)
     if problem.balances.has_gap:
         # noise about where a load turns makes the twist jump by the whole gap: no small error, and
         # what it adds to products is none of a straight line. Such rows count less already

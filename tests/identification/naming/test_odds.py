@@ -446,13 +446,3 @@ def test_a_name_that_takes_the_gear_for_the_motor_is_not_what_is_missing(tmp_pat
     (gear,) = (c for c in found.claims if c.balance == "deflection")
     assert all(EFFECTS[n].reads == {"torsion"} for n in gear.effects)
     assert all(e.ratio < 1.2 for e in found.steps[-1].held_out.balances.values())
-
-
-def test_where_something_is_missing_for_certain_the_names_share_all_of_it() -> None:
-    """Held-out rows exclude that nothing is; between the names they change nothing."""
-    odds = Odds((), {"a": 0.06, "b": 0.02}, {}, nothing=0.9)
-    assert odds.empty
-    sure = odds.one_of_them
-    assert not sure.empty
-    assert sure.nothing == 0.0
-    assert dict(sure.probability) == pytest.approx({"a": 0.75, "b": 0.25})
