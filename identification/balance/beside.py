@@ -141,7 +141,7 @@ class Basis:
     @classmethod
     def of(cls, columns: Sequence[FloatArray]) -> Basis:
         """Of columns, (rows,) or (rows, k) each."""
-        basis = independent(columns)
+        basis = orthonormal(columns)
         return cls(basis, _products([basis]))
 
     def rest(
@@ -177,7 +177,7 @@ class Basis:
         return rest
 
 
-def independent(columns: Sequence[FloatArray], weight: FloatArray | None = None) -> FloatArray:
+def orthonormal(columns: Sequence[FloatArray], weight: FloatArray | None = None) -> FloatArray:
     """Columns (rows, any) that span the same as those given, (rows,) or (rows, k) each, but for
     directions that rounding makes; orthonormal where each row counts by its weight (rows,).
 
@@ -250,7 +250,7 @@ __all__ = [
     "between",
     "bounded",
     "curve_nodes",
-    "independent",
+    "orthonormal",
     "motion_of",
     "rest_beside",
     "scaled",

@@ -21,7 +21,7 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.beside import between, independent
+from identification.balance.beside import between, orthonormal
 from identification.fitting.covariance import follows
 
 FloatArray = npt.NDArray[np.float64]
@@ -227,7 +227,7 @@ def beside(columns: FloatArray, weight: FloatArray) -> Callable[[FloatArray], Fl
     columns : (n, k) array
     weight : (n,) array
     """
-    basis = independent([columns], weight)
+    basis = orthonormal([columns], weight)
 
     def left(values: FloatArray) -> FloatArray:
         return np.asarray(values - basis @ ((weight * values) @ basis), dtype=np.float64)
