@@ -1162,6 +1162,7 @@ class Session:
                 if len(renewed.effects) <= LARGEST_SET and all(
                     c.label != renewed.label for c in current
                 ):
+                    self._stands_for(renewed, claim)
                     current[position] = renewed
                     return self._replay(current, standing)
             if same is not None:

@@ -375,7 +375,8 @@ def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatA
 
     A law whose rows leave far less than the noise it is said to pass on does not pass it on: a
     slope that runs away where hardly a row is makes a level of thousands of N.m of some draws.  It
-    may leave what the calmest of the others may.
+    may leave what it does leave, as far as others may: no less than the calmest of them, which may
+    pass on little as it stands for an inertia, and no more than the loudest.
     """
     drawn, believed = [], []
     for rival in rivals:
@@ -387,9 +388,11 @@ def _believable(rivals: Sequence[Rival], data: Dataset) -> list[dict[str, FloatA
     for b in data.sensing.balances:
         least = CONTRADICTED * max(x[b] for x in believed)
         sure = [k for k, x in enumerate(believed) if x[b] >= least]
-        calm = [min(drawn[k][n][b] for k in sure) for n in range(len(data.train))]
         for k, level in enumerate(levels):
-            own = [at[b] for at in drawn[k]] if k in sure else calm
+            own = np.array([at[b] for at in drawn[k]])
+            if k not in sure:
+                others = np.array([[at[b] for at in drawn[i]] for i in sure])
+                own = np.clip(believed[k][b] * own, others.min(axis=0), others.max(axis=0))
             level[b] = np.repeat(own, [w.rows for w in data.train])
     return levels
 

@@ -105,8 +105,10 @@ def unmodelled_by(contest: Contest, balance: str) -> float:
 def contenders(
     claimed: Sequence[str], near: Mapping[str, float], allowance: float
 ) -> tuple[str, ...]:
-    """Names that are worth a whole fit: those of the set, and those whose trial is no more behind
-    than what is not modelled.
+    """Names that are worth a whole fit: those of the set, those whose trial is no more behind
+    than what is not modelled, and those whose trial is that of another name of the set: where an
+    offset of the current may stand for the name, one of the torque sensor may as well if both are
+    one column there.
 
     Parameters
     ----------
@@ -118,10 +120,13 @@ def contenders(
         What is not modelled [nats].
     """
     limit = SCREEN * max(allowance, FEWEST)
+    others = [near[n] for n in claimed[1:] if n in near]
     more = [
         n
         for n, lost in sorted(near.items(), key=lambda item: item[1])
-        if n not in claimed and lost <= limit and claimed[0] not in EFFECTS[n].contains
+        if n not in claimed
+        and (lost <= limit or any(abs(lost - other) <= FEWEST for other in others))
+        and claimed[0] not in EFFECTS[n].contains
     ]
     return (*claimed, *more[: max(0, MOST_FITTED - len(claimed))])
 

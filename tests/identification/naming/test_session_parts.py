@@ -846,6 +846,21 @@ def test_a_better_name_takes_the_place_of_an_earlier_one(swapping: World) -> Non
     assert [s.solution.model.virtual_work for s in found.steps] == [True, True, False]
 
 
+def test_a_name_that_gave_its_place_is_fitted_whole_beside_the_one_that_took_it(
+    swapping: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It gave it by a linear trial, with the shapes of a model that lacks it."""
+    asked: dict[str, Shares] = {}
+
+    def odds(claim: Claim, near: Shares, now: Step, last: Ranking) -> Odds | None:
+        asked[claim.effects[0]] = near
+        return None
+
+    monkeypatch.setattr(swapping, "odds", odds)
+    assert named(ended(swapping)) == ["stribeck", "quadratic_drag"]
+    assert asked["stribeck"]["added_spring"] == 0.0
+
+
 @pytest.mark.parametrize("form", [True, False])
 def test_the_form_of_a_law_is_asked_again_beside_the_rest(base: Base, form: bool) -> None:
     laws = {"added_spring": {"p": 1.0}, "quadratic_drag": {"q": 1.0}}
