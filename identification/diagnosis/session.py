@@ -801,7 +801,13 @@ class Session:
                 or (longer and not set(found.claims[0].effects) < set(longer.claims[-1].effects))
             ):
                 continue
-            claim = replace(found.claims[0], kernel=bench.data.kernel, partial=False)
+            claim = found.claims[0]
+            # in part or not is said of the rows that show it: short ones have noise in its place
+            claim = replace(
+                claim,
+                kernel=bench.data.kernel,
+                partial=_hardly(claim.balance, there, found.steps[-1], found.steps[-1]),
+            )
             model = with_effect(now.model, claim.label)
             start = {**now.values, **found.steps[-1].solution.values}
             after = self.bench.step(
@@ -809,6 +815,11 @@ class Session:
             )
             # by how much the short rows fall or rise is their noise
             if spoilt(standing.now.held_out, after.held_out):
+                continue
+            if _is_nothing(claim.label, after.solution):
+                self._refused[claim.label] = (
+                    f"is zero in the rows of the fit; rows of {bench.data.kernel:.2g} s show it"
+                )
                 continue
             longer = _Standing((*standing.steps, after), (*standing.claims, claim))
             if len(claim.effects) == 1:
@@ -1255,12 +1266,9 @@ class Session:
         left there at the end, or no more than a table over one variable.
         """
         left = next((u for u in where if u.balance == claim.balance), None)
-        if left is None:
+        if left is None or claim.partial:
             return claim
-        old, new, end = (s.held_out.balances[claim.balance] for s in (before, after, last))
-        own = max(old.rms**2 - new.rms**2, 0.0)
-        over = max(end.rms**2 - end.floor**2, 0.0)
-        partial = own < EXPLAINED_SHARE * (own + over) or claim.effect.stage == "late"
+        partial = _hardly(claim.balance, before, after, last) or claim.effect.stage == "late"
         if not partial and left.share_percent >= LOCATED_SHARE and not claim.effect.common:
             partial = is_absorbed(claim, left, last.solution, self.data)
         return replace(claim, partial=partial)
@@ -1376,6 +1384,21 @@ def _left(bench: Bench, step: Step | None) -> float:
     """
     step = step or bench.step(None, None, bench.start())
     return math.prod(max(e.ratio, 1.0) for e in bench.ratios(step).values())
+
+
+def _hardly(balance: str, before: Step, after: Step, last: Step) -> bool:
+    """Whether a step explains less of a balance than is left there over the floor at the end."""
+    old, new, end = (s.held_out.balances[balance] for s in (before, after, last))
+    own = max(old.rms**2 - new.rms**2, 0.0)
+    over = max(end.rms**2 - end.floor**2, 0.0)
+    return own < EXPLAINED_SHARE * (own + over)
+
+
+def _is_nothing(label: str, solution: Solution) -> bool:
+    """Whether all amplitudes of an effect of a fitted model are zero."""
+    term = next(t for t in solution.model.terms if t.label == label)
+    pairs = zip(term.names, term.effect.parameters, strict=True)
+    return not any(solution.values[n] for n, p in pairs if not p.is_shape)
 
 
 def _standing_over(step: Step) -> set[str]:

@@ -107,10 +107,9 @@ def verdict_of(
             unnamed, ratios[unnamed.balance].unit
         )
     if claims:
-        return (
-            "complete",
-            f"Missing: {names}; with it {fall}, and what is left looks like measurement noise.",
-        )
+        found = f"Missing: {names}; with it {fall}" if names else f"{fall[0].upper()}{fall[1:]}"
+        only = f" Only part of what such rows show is explained by: {parts}." if parts else ""
+        return "complete", f"{found}, and what is left looks like measurement noise.{only}"
     return (
         "nothing_missing",
         "The model explains the records down to their measurement noise: nothing is missing that "

@@ -434,6 +434,45 @@ def test_a_set_of_longer_rows_is_asked_on_still_longer_ones(
     assert claim.kernel == length
 
 
+@pytest.mark.parametrize(("beside", "partial"), [(0.0, False), (5.0, False), (30.0, True)])
+def test_a_name_is_one_in_part_where_longer_rows_show_more_than_it_explains(
+    beside: float, partial: bool, base: Base
+) -> None:
+    """Short rows have noise in the place of both, and nothing in them says so."""
+    laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}}
+    hidden = {"p": HIDDEN_BY_NOISE, "q": beside / 40}
+    quiet, shown = (World(base, h, laws) for h in (hidden, {"p": 8.0, "q": beside}))
+    longer = {2.0: quiet, 4.0: shown}
+    found = ended(World(base, hidden, laws, longer=longer))
+    (claim,) = found.claims
+    assert claim.partial == partial
+    assert found.verdict == "complete"
+    assert ("Missing: quadratic drag" in found.reason) != partial
+    assert (
+        "Only part of what such rows show is explained by: quadratic" in found.reason
+    ) == partial
+    assert found.outcome == ("complete" if partial else "found")
+
+
+def test_a_name_of_longer_rows_that_the_fit_leaves_at_zero_is_none(
+    base: Base, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}}
+    quiet, shown = (World(base, {"p": p}, laws) for p in (HIDDEN_BY_NOISE, 8.0))
+    world = replace(quiet, longer={2.0: quiet, 4.0: shown})
+    plain = world.fitted
+
+    def fitted(model: JointModel, start: Mapping[str, float], *, again: bool = False) -> Solution:
+        whole = plain(model, start, again=again)
+        return replace(whole, values={n: 0.0 if "drag" in n else x for n, x in start.items()})
+
+    assert [c.effects for c in ended(world).claims] == [("quadratic_drag",)]
+    monkeypatch.setattr(world, "fitted", fitted)
+    found = ended(world)
+    assert not found.claims
+    assert "is zero in the rows of the fit" in found.why("quadratic_drag")
+
+
 def test_what_a_name_does_to_longer_rows_stays_where_the_steps_are_made_again(base: Base) -> None:
     laws: dict[str, Shares] = {"quadratic_drag": {"p": 1.0}}
     short = World(base, {"p": HIDDEN_BY_NOISE}, laws)
