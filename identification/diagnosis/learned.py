@@ -4,6 +4,7 @@ does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, final
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, Effect, JointModel
 from casadi_models.table import Table
 from identification.balance.dataset import Dataset
-from identification.balance.stacked import references, sticking_torque
+from identification.balance.stacked import TURN_WIDTHS, references, sticking_torque
 from identification.data.joint_file import Correlation
 from identification.diagnosis.candidates import Candidate
 from identification.diagnosis.claims import Claim
@@ -649,8 +650,8 @@ def _place(solution: Solution, name: str) -> str:
 
 def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]:
     """Where dry friction is certainly not that of a curve over velocity, carried back to zero
-    speed: as friction that changes its sign at once, and as one that does so as smoothly as the
-    model has it, since the first knots may lie where it still does.
+    speed from where friction has reached its level: slower, the curve shows how it changes its
+    sign.
     """
     out = {}
     for c in curves:
@@ -659,13 +660,12 @@ def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]
         if table is None or not (table.of_speed and table.odd):
             continue
         torque = sticking_torque(solution.model, solution.values, place)
-        smooth = [solution.values[n] for n in solution.model.named("smoothing", place)]
-        starts = [_start(c, torque, width) for width in (0.0, *smooth)]
-        if torque and not any(
-            abs(torque - (low + high) / 2) <= OUTSIDE / BAND * (high - low) / 2
-            for low, high in starts
-        ):
-            low, high = starts[0]
+        widths = [solution.values[n] for n in solution.model.named("smoothing", place)]
+        start = _start(c, TURN_WIDTHS * max(widths, default=0.0))
+        if not torque or start is None:
+            continue
+        low, high = start
+        if abs(torque - (low + high) / 2) > OUTSIDE / BAND * (high - low) / 2:
             out[place] = Doubt(
                 place,
                 f"the dry friction of the {place} side, {torque:.3g} {c.y_unit}, is an artefact: "
@@ -674,15 +674,23 @@ def _no_dry_friction(solution: Solution, curves: Sequence[Curve]) -> list[Doubt]
     return list(out.values())
 
 
-def _start(curve: Curve, torque: float, width: float) -> tuple[float, float]:
-    """Band of a curve over velocity at zero speed, carried on from its first two knots beside dry
-    friction that changes its sign over a speed `width`.
+def _start(curve: Curve, slowest: float) -> tuple[float, float] | None:
+    """Band of a curve over velocity at zero speed, carried on in a straight line from its first
+    knot above `slowest` and one at twice that speed: neighbours hardly show a slope. Errors so far
+    apart count as independent. None where the curve does not reach so far.
     """
-    x = curve.x[:2]
-    dry = torque * np.tanh(x / width) if width > 0 else np.full(2, torque)
-    rest = curve.y[:2] - dry
-    moved = dry[0] - torque + (rest[1] - rest[0]) / (x[1] - x[0]) * x[0]
-    return float(curve.low[0] - moved), float(curve.high[0] - moved)
+    first = int(np.searchsorted(curve.x, slowest, side="right"))
+    second = int(np.searchsorted(curve.x, 2.0 * curve.x[first])) if first < len(curve.x) else first
+    if second >= len(curve.x) or second == first:
+        return None
+    near, far = curve.x[first], curve.x[second]
+    share = near / (far - near)
+    start = (1 + share) * curve.y[first] - share * curve.y[second]
+    off = math.hypot(
+        (1 + share) * (curve.high[first] - curve.low[first]) / 2,
+        share * (curve.high[second] - curve.low[second]) / 2,
+    )
+    return float(start - off), float(start + off)
 
 
 def marked(

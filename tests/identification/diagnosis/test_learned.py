@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +253,29 @@ def test_dry_friction_that_changes_its_sign_over_a_few_knots_is_none(width: floa
     (curve,) = curves_on(moving, "axis", own, most=1, certain=False).curves
     assert curve.x[0] < 3 * width
     assert artefacts(found.solution, found.data, [curve]) == ()
+
+
+@pytest.mark.parametrize("off", [0.0, 2.0])
+def test_dry_friction_is_that_of_a_curve_where_friction_has_reached_its_level(off: float) -> None:
+    """Knots below that are of how it changes its sign, and two neighbours show no slope: of a joint
+    that warmed, with knots at a third of the smoothing velocity, 24 N.m of dry friction were called
+    an artefact of 7.
+    """
+    found = run(39, nothing)
+    (curve,) = curves_on(
+        steadily_moving(make_base(found.solution, found.data)),
+        "axis",
+        lambda c: c.effect.key == "learned_velocity",
+        most=1,
+        certain=False,
+    ).curves
+    width = found.solution.values["motor_smoothing_velocity"]
+    x = width * np.geomspace(0.4, 200.0, 40)
+    values = found.solution.values
+    y = values["motor_coulomb"] + off + values["motor_viscous"] * x
+    y = y * np.tanh((x / width) ** 2) + 0.1 * (-1.0) ** np.arange(len(x))
+    curve = replace(curve, x=x, y=y, low=y - 0.2, high=y + 0.2)
+    assert bool(artefacts(found.solution, found.data, [curve])) == (off > 0)
 
 
 def asked(seed: int, law: Law) -> Improvement:
