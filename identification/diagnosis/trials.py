@@ -16,6 +16,7 @@ import numpy.typing as npt
 from casadi_models import EFFECTS, Effect, JointModel
 from identification.balance.balances import Balances, balances_of
 from identification.balance.calibration import bare, names_of_runs, settled, within_limits
+from identification.balance.colour import LEVEL_ERROR
 from identification.balance.dataset import HOLD_NAME
 from identification.balance.noise import effective_share
 from identification.balance.stacked import (
@@ -700,6 +701,9 @@ def _score(
     there, amplitude = np.append(delta, 1.0), delta[own:] / size
     if not np.any(amplitude):
         return None
+    if noise is not None:  # its squares are known to so much: no less can be said to be left
+        least = LEVEL_ERROR * np.einsum("bij,i,j->b", noise, there, there)
+        sse1 += base.noise_share * np.maximum(least - sse1.sum(axis=0), 0.0)
     told = _told(base, sse1)
     values = {**shapes, **dict(zip(candidate.amplitudes, map(float, amplitude), strict=True))}
     unit = np.ones(len(base.balances))

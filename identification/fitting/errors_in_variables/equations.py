@@ -114,6 +114,8 @@ def unbiased(
             if (far := found.far_from(start)).any():
                 ways += [moves & ~far] if moving is moves else []
                 continue
+            if not found.has_squares:
+                continue
             # where it began: a correction that ran away may end where all is noise
             share = equations.largest_share(moving)
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
@@ -193,6 +195,13 @@ class _Equations:
             return own, None
         return own, self.turns.without(self.instruments.beside(plain, self.problem))
 
+    @property
+    def has_squares(self) -> bool:
+        """Whether the squares of all rows and columns are numbers."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            squares = np.append(np.sum(self.columns[0] ** 2, axis=0), self.rows @ self.rows)
+        return bool(np.isfinite(squares).all())
+
     def far_from(self, start: _Equations) -> npt.NDArray[np.bool_]:
         """Scales that are not nearly what they were, (free,)."""
         far = np.zeros(len(self.x), dtype=np.bool_)
@@ -245,8 +254,10 @@ class _Equations:
         met = here.instruments.met if here.instruments else frozenset[str]()
         for _ in range(STEPS):
             problem = here.problem.moved(here.x + here.next_step(limits, moves))
-            noise = noise_products(problem, met, believed=here.believed)
-            here = replace(here, problem=problem, noise=noise, drawn=None)
+            here = replace(here, problem=problem, drawn=None)
+            if not here.has_squares:  # it has run away: no farther step is a number
+                break
+            here = replace(here, noise=noise_products(problem, met, believed=here.believed))
         return here
 
     def next_step(

@@ -211,6 +211,29 @@ def test_rows_that_noise_leaves_open_refuse_nothing() -> None:
     assert made_worse(error(0.5, 10.0), error(0.52, 9.0)).startswith("the held-out error rises")
 
 
+def test_a_rise_to_what_noise_leaves_is_none() -> None:
+    """Beside the missing friction of the motor noise is taken off the rows, and the link's inertia
+    is half as much again, as it is in truth: it passes more of the encoder's noise on.
+    """
+
+    def error(motor: float, link: float, floor: float) -> Error:
+        left = {"motor": (motor, 0.1), "link": (link, floor)}
+        return Error(
+            0.0,
+            0.0,
+            0.0,
+            {
+                b: BalanceError(x, f, x / f, "N.m", np.full(4, x), np.ones(4))
+                for b, (x, f) in left.items()
+            },
+        )
+
+    before = error(0.7, 3.3, 2.8)
+    assert made_worse(before, error(0.1, 4.2, 4.2)) == ""
+    assert "link" in made_worse(before, error(0.1, 4.2, 2.8))
+    assert "motor" in made_worse(before, error(0.9, 4.2, 4.2))
+
+
 @pytest.mark.parametrize("speed", [0.002, 0.02, 0.2])
 @pytest.mark.parametrize("beside", [0.0, 0.2])
 def test_what_the_steps_of_an_encoder_take_off_a_slow_motion_is_drawn(
