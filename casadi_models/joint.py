@@ -439,8 +439,13 @@ class JointModel:
 
     @cached_property
     def functions(self) -> Any:
-        """CasADi functions of the joint (see :mod:`casadi_models.functions`)."""
-        return JointFunctions(self)
+        """CasADi functions of the joint (see :mod:`casadi_models.functions`).
+
+        An elastic joint that moves by its own equations knows the torque of its gear, which is the
+        load of it whatever a record of its motion may show.
+        """
+        blind = self.is_elastic and self.load_from == "motion"
+        return JointFunctions(replace(self, load_from="torque") if blind else self)
 
     @property
     def dynamics(self) -> Any:

@@ -362,6 +362,24 @@ def test_load_from_the_motion_of_the_link_is_what_a_twisting_gear_carries() -> N
     )
 
 
+@pytest.mark.parametrize("place", ["motor", "link"])
+def test_a_joint_moves_by_the_torque_of_its_gear_whatever_its_records_show(place: str) -> None:
+    """Two encoders show the load by the motion of the link; by that the motion cannot be told."""
+    model = JointModel.harmonic_drive(3).add("gravity").add(f"load_dependent_friction@{place}")
+    model = model.with_values(
+        {**TABLE_4_3, "gravity_torque": -100.0, f"{place}_load_friction": 0.1}
+    )
+    seen, x = replace(model, load_from="motion"), [0.305, 0.5, 0.3, 0.4]
+    given = (x, np.zeros(3), model.value_vector())
+    both = zip(
+        (model.dynamics(*given), *model.jacobian(*given)),
+        (seen.dynamics(*given), *seen.jacobian(*given)),
+        strict=True,
+    )
+    for one, other in both:
+        np.testing.assert_array_equal(np.array(one), np.array(other))
+
+
 @pytest.mark.parametrize("cubic", [0.0, 1.174e9])
 def test_sensor_compliance_is_a_spring_in_series(cubic: float) -> None:
     model = JointModel.harmonic_drive(3).add("cubic_stiffness").add("torque_sensor_compliance")
