@@ -677,12 +677,13 @@ def test_two_sessions_do_not_disturb_each_other(client: Client) -> None:
 
 def test_a_job_can_be_cancelled_and_changes_nothing(client: Client, fitted: str) -> None:
     before = client.get(fitted)
-    assert client.post(f"{fitted}/run", {"action": "diagnose"})[0] == 202
-    time.sleep(0.3)
+    # the longest there is: on a busy machine a diagnosis ended before it was cancelled
+    assert client.post(f"{fitted}/run", {"action": "improve"})[0] == 202
     status, text = client.post(f"{fitted}/run", {"action": "fit"})
     assert status == 409
     assert "wait for it or cancel it" in text
     assert client.raw("DELETE", f"{fitted}/file/{before['files'][0]['id']}")[0] == 409
+    time.sleep(0.1)
     client.post(f"{fitted}/cancel")
     after = client.wait(fitted)
     assert "cancelled" in after["error"]
