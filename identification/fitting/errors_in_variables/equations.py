@@ -253,11 +253,12 @@ class _Equations:
         here = self
         met = here.instruments.met if here.instruments else frozenset[str]()
         for _ in range(STEPS):
-            problem = here.problem.moved(here.x + here.next_step(limits, moves))
-            here = replace(here, problem=problem, drawn=None)
-            if not here.has_squares:  # it has run away: no farther step is a number
+            if not here.has_squares:  # it has run away, and no farther step is a number
                 break
-            here = replace(here, noise=noise_products(problem, met, believed=here.believed))
+            problem = here.problem.moved(here.x + here.next_step(limits, moves))
+            with np.errstate(over="ignore", invalid="ignore"):  # there, which the next look ends
+                noise = noise_products(problem, met, believed=here.believed)
+            here = replace(here, problem=problem, noise=noise, drawn=None)
         return here
 
     def next_step(
