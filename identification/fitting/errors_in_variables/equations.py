@@ -9,6 +9,7 @@ Measurement Error Models, section 2.2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -119,8 +120,7 @@ def unbiased(
             # where it began: a correction that ran away may end where all is noise
             share = equations.largest_share(moving)
             hidden = found.rows @ found.rows <= began * (1 + MOST_HIDDEN * share / (1 - share))
-            hidden &= found.rows @ found.rows <= began + MOST_HIDDEN * found.noise_squares
-            if hidden and found.as_near_as(start):
+            if hidden and found.no_more_than_noise(start) and found.as_near_as(start):
                 left = found.left(bounds, moving)
                 return Unbiased(dict(found.problem.values), found.noise, found.instruments, left)
     left = start.left(bounds, moves)
@@ -218,9 +218,21 @@ class _Equations:
         met = self.instruments.met if self.instruments else frozenset[str]()
         return all(after[b][0] <= before[b][0] * (1 + SURE_ERRORS * after[b][1]) for b in met)
 
+    def no_more_than_noise(self, start: _Equations) -> bool:
+        """Whether the squares of all rows rose by no more than those of their noise did.
+
+        Without the noise they are smallest here. So what the rows of the least squares leave less
+        is noise that these pass on less: a damping at zero passes on none. Beside it the squares of
+        noise scatter, and its level is known to :data:`~identification.balance.colour.LEVEL_ERROR`.
+        """
+        before, after = start.noise_squares, self.noise_squares
+        scatter = SURE_ERRORS * math.sqrt(2 / max(INDEPENDENT_SHARE * len(self.rows), 1.0))
+        rise = float(self.rows @ self.rows - start.rows @ start.rows)
+        return rise <= (1 + LEVEL_ERROR) * max(after - before, 0.0) + scatter * after
+
     @property
     def noise_squares(self) -> float:
-        """Squares of all rows, weighted, that are noise: more the least squares cannot hide."""
+        """Squares of all rows, weighted, that are noise as believed."""
         problem, train = self.problem, self.problem.data.train
         model, total = problem.balances.model, 0.0
         levels = [drawn_floors(model, problem.data, problem.values, w) for w in train]
@@ -228,7 +240,8 @@ class _Equations:
             level = np.concatenate(
                 [np.full(w.rows, x[b]) for w, x in zip(train, levels, strict=True)]
             )
-            total += float(np.sum((level * problem.weights[b])[taking_part(b, train)] ** 2))
+            level = self.believed[b] * level * problem.weights[b]
+            total += float(np.sum(level[taking_part(b, train)] ** 2))
         return total
 
     @cached_property
