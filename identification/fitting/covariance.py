@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, final
 
 import numpy as np
 import numpy.typing as npt
@@ -145,12 +146,36 @@ def windows_over(times: Sequence[FloatArray]) -> Any:
     return csr_array(block_diag(parts))
 
 
+@final
+@dataclass(frozen=True)
+class WindowNoise:
+    """What noise of the columns adds to what windows hold of the normal equations, taken off.
+
+    Attributes
+    ----------
+    grams : (windows, p, p) array
+        To the products of the columns in the core of each window.
+    scores : (windows, p) array
+        To those with the residual over the window.
+    whole : (p, p) array
+        Normal matrix of all rows, as much of it as is certain without the noise.
+    kept : (p, p) array
+        What makes this of the whole less the noise: K with K (gram - noise) K' = whole.  Of each
+        window no more is certain; without it one that holds a tenth of what is left there would
+        hold all of what is certain, and the error of a fit that leaves it out would be anything.
+    """
+
+    grams: FloatArray
+    scores: FloatArray
+    whole: FloatArray
+    kept: FloatArray
+
+
 def window_errors(
     jacobian: FloatArray,
     residual: FloatArray,
     windows: Any,
-    noise: tuple[FloatArray, FloatArray] | None = None,
-    whole: FloatArray | None = None,
+    noise: WindowNoise | None = None,
     met_by: FloatArray | None = None,
 ) -> FloatArray | None:
     """Standard error of each parameter of a least-squares fit whose rows depend on each other
@@ -164,11 +189,7 @@ def window_errors(
         Weighted, at the fit.
     windows : (windows, n) sparse array
         Of :func:`windows_over`; rows of zeros take part in the fit only.
-    noise : ((windows, p, p) array, (windows, p) array), optional
-        What noise of the columns adds to the products of the columns in the core of each window,
-        and to those with the residual over the window; taken off.
-    whole : (p, p) array, optional
-        Normal matrix of all rows, that of the noise taken off.
+    noise : WindowNoise, optional
     met_by : (n, p) array, optional
         Columns of the equations where these are not those of the rows themselves: what instruments
         say of them, so that their squares are their products with the rows' own
@@ -183,9 +204,10 @@ def window_errors(
     core = cores(windows)
     parts = np.split(core.indices, core.indptr[1:-1])
     grams = np.array([by[rows].T @ by[rows] for rows in parts])
+    total = by.T @ by
     if noise is not None:
-        grams, scores = grams - noise[0], scores - noise[1]
-    total = by.T @ by if whole is None else whole
+        grams = noise.kept @ (grams - noise.grams) @ noise.kept.T
+        scores, total = scores - noise.scores, noise.whole
     return errors_of_windows(grams, scores, total, independent(windows))
 
 

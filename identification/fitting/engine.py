@@ -30,6 +30,7 @@ from identification.balance.noise import effective_share
 from identification.balance.sensing import idle_shapes
 from identification.balance.stacked import (
     Stacked,
+    drawn_floors,
     floor_rows,
     floors,
     references,
@@ -230,6 +231,12 @@ def _left(model: JointModel, values: Mapping[str, float], data: Dataset) -> floa
     return rms(stack(balances_of(model, data.sensing, wrt=()), data.train, values).residual["axis"])
 
 
+def _noise(model: JointModel, values: Mapping[str, float], data: Dataset) -> float:
+    """RMS of what noise makes of them."""
+    levels = [drawn_floors(model, data, values, w)["axis"] for w in data.train]
+    return rms(np.repeat(levels, [w.rows for w in data.train]))
+
+
 def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     """Values with a link that swings unseen, where it shows itself in the rows of a model that
     was fitted as rigid; else None. A damper alone is no swing.
@@ -241,6 +248,9 @@ def _swings(rigid: Solution, data: Dataset) -> dict[str, float] | None:
     limits = bounds_of(model, data.joint.known, data)
     values, _ = WeakForm(balances, data, rigid.values, tuple(free), rigid.weights).fitted(limits, 6)
     sizes = [_left(model, v, data) for v in (rigid.values, values)]
+    # the load's lag takes noise of the torque off the rows: that alone is no swing
+    noise = [_noise(model, v, data) for v in (rigid.values, values)]
+    sizes[1] = math.sqrt(sizes[1] ** 2 + max(noise[0] ** 2 - noise[1] ** 2, 0.0))
     lag = model.swinging_inertia(values) * values[LOAD_COMPLIANCE.name]
     slow = lag * (2 * math.pi * HIGHEST_SWING / data.kernel) ** 2 > 1
     return values if slow and sizes[1] < (1 - LEAST_SWING) * sizes[0] else None

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from identification.balance.stacked import taking_part
 from identification.fitting.covariance import (
     RANK,
+    WindowNoise,
     known_errors,
     window_errors,
     windows_over,
@@ -22,6 +23,7 @@ from identification.fitting.covariance import (
 from identification.fitting.errors_in_variables.instruments import mixed
 from identification.fitting.errors_in_variables.products import (
     Unbiased,
+    kept,
     known,
     level_error,
 )
@@ -122,15 +124,16 @@ class Bands:
         gram = meeting.T @ scaled
         gram = (gram + gram.T) / 2
         added, pulled = noise.whole
-        whole = known(gram, added / unit, level_error(problem.data))
+        certain = (gram, added / unit, level_error(problem.data))
+        whole = known(*certain)
         windows, tiled = self._windows
         grams, scores = noise.by_window(
             {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()},
             windows,
             {b: taking_part(b, problem.data.train) for b in problem.balances.balances},
         )
-        apart = (grams / unit, scores / norms)
-        errors = window_errors(scaled, self._rows, tiled, apart, whole, meeting)
+        apart = WindowNoise(grams / unit, scores / norms, whole, kept(*certain))
+        errors = window_errors(scaled, self._rows, tiled, apart, meeting)
         if errors is not None:
             # rows of the prior were made heavier by the share; they scatter as the prior does
             unsure = known_errors(whole, problem.prior[:, index] / norms) / math.sqrt(self.share)

@@ -230,8 +230,19 @@ def known(whole: FloatArray, noise: FloatArray, unsure: float) -> FloatArray:
     :func:`whole_without`.
     """
     share, left = shares(whole, noise)
-    share = np.clip(share * (1 + unsure), 0.0, KNOWN_NOISE)
-    return np.asarray(left * (1 - share) @ left.T, dtype=np.float64)
+    return np.asarray(left * _known(share, unsure) @ left.T, dtype=np.float64)
+
+
+def kept(whole: FloatArray, noise: FloatArray, unsure: float) -> FloatArray:
+    """K with K (whole - noise) K' = :func:`known`, (p, p), where the noise leaves more than that:
+    what makes the certain part of a part of them."""
+    share, left, right = _apart(whole, noise)
+    rest = _known(share, unsure)
+    return np.asarray(left * np.sqrt(rest / np.maximum(1 - share, rest)) @ right.T)
+
+
+def _known(share: FloatArray, unsure: float) -> FloatArray:
+    return np.asarray(1 - np.clip(share * (1 + unsure), 0.0, KNOWN_NOISE))
 
 
 def told(whole: FloatArray, noise: FloatArray, unsure: float) -> FloatArray:
@@ -302,6 +313,7 @@ __all__ = [
     "certain",
     "drawn_rows",
     "each_drawn",
+    "kept",
     "known",
     "level_error",
     "moved_rows",
