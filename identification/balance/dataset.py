@@ -505,6 +505,7 @@ def weak_record(
                 for c, own in noise.items()
                 if c in signals
             },
+            lost=~record.measured,
         )
     return made
 

@@ -628,10 +628,13 @@ def beginnings(
 
 
 def support_of(records: Sequence[WeakRecord]) -> FloatArray:
-    """Root of the share of its samples that each row has, (rows,): one of which samples were lost
-    averages fewer of them, and its variance grows with one over what is left.
+    """Root of the share of its samples that each row has over that of all rows of its record,
+    (rows,): one of which samples were lost averages fewer of them, and its variance grows with one
+    over what is left. What the lost ones add to the rows of a record on the whole is in the noise
+    that is drawn for it.
     """
     share = [np.ones(w.rows) if w.support is None else w.support for w in records]
+    share = [x / max(float(x.mean()), 1e-300) for x in share]
     return np.asarray(np.sqrt(np.concatenate(share)), dtype=np.float64)
 
 

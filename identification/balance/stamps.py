@@ -546,6 +546,20 @@ def bridged(
     return out
 
 
+def bridged_over(values: FloatArray, lost: BoolArray, segments: tuple[slice, ...]) -> FloatArray:
+    """Values on an even grid (n,) with cubics through their neighbours in the place of those that
+    are `lost`, as the readings were bridged.
+    """
+    out = values.copy()
+    for part in segments:
+        there, open_ = np.flatnonzero(~lost[part]), np.flatnonzero(lost[part])
+        if open_.size and len(there) >= SAMPLES:
+            known = values[part][there, None]
+            at = open_.astype(np.float64)
+            out[part][open_] = _cubic(there.astype(np.float64), known, at)[:, 0]
+    return out
+
+
 def bridge_errors(
     values: FloatArray, measured: BoolArray, segments: tuple[slice, ...], level: float
 ) -> FloatArray:

@@ -328,6 +328,8 @@ class WeakRecord:
     bridging : mapping of str to (samples,) array
         Standard deviation by which bridged samples of a signal may be off beside its noise, where
         some are.
+    lost : (samples,) bool array, optional
+        Which samples are bridged; none where it is None.
     name : str
         Tells the record from all others: its calibration unknowns go by it.
     shifts : mapping of str to float
@@ -353,6 +355,7 @@ class WeakRecord:
     paired: Mapping[str, FloatArray] = field(default_factory=dict)
     doubts: tuple[Mapping[str, FloatArray], ...] = ()
     bridging: Mapping[str, FloatArray] = field(default_factory=dict)
+    lost: npt.NDArray[np.bool_] | None = None
     filters: Mapping[str, Filter] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -269,8 +269,10 @@ def _squares(left: Sequence[tuple[int, float]]) -> float:
 
 
 def _over(left: Sequence[tuple[int, float]]) -> float:
-    """What is left over noise, in all balances."""
-    return math.prod(max(ratio, 1.0) for _, ratio in left)
+    """What is left over noise, in all balances. Levels of noise are known to a tenth or two, and no
+    shift of a reading follows noise: a fall below them counts as any other.
+    """
+    return math.prod(ratio for _, ratio in left)
 
 
 def _half_cycle(left: Callable[[float], Sequence[tuple[int, float]]]) -> float:

@@ -23,8 +23,10 @@ from identification.balance.stacked import (
     _between_samples,
     _either_direction,
     _either_way,
+    support_of,
     unsure,
 )
+from identification.balance.stamps import bridged_over
 from identification.balance.weak import prepare
 from identification.data.joint_file import Joint
 from identification.diagnosis.improvement import judged_drop, made_worse
@@ -260,6 +262,58 @@ def test_what_the_steps_of_an_encoder_take_off_a_slow_motion_is_drawn(
         )
         true = w.averaged[name] - still.averaged[name]
         assert np.std(found) == pytest.approx(np.std(true), rel=0.2), name
+
+
+@pytest.mark.parametrize("steps", [2.0, 2.02, 2.35])
+def test_steps_beat_with_the_samples_at_the_speed_of_their_own_side(steps: float) -> None:
+    """A joint that goes nearly a whole number of steps a sample has an error that stays for many of
+    them. A weight that turns winds the gear, and at a hundredth of another speed the beat is
+    another one: an error of nothing was drawn as one of ten times as much, and the other way round.
+    """
+    dt, step = 1e-3, 2 * np.pi / 2**14
+    t = dt * np.arange(8000)
+    speed, rng = steps * step / dt, np.random.default_rng(3)
+    motor = speed * t
+    link = motor - 4e-3 * np.sin(motor) + 1e-6 * rng.standard_normal(len(t))
+    read = step * np.rint(link / step)
+    signals = {"motor_position": motor, "link_position": read}
+    w = prepare(t, signals, (slice(0, len(t)),))
+    still = prepare(t, {"motor_position": motor, "link_position": link}, (slice(0, len(t)),))
+    noise = white(step * 12**-0.5).read_in(step)
+    sources = {"motor_position": white(1e-9), "link_position": noise}
+    found = np.concatenate(
+        [
+            d.noisy.averaged["link_position"] - d.calm.averaged["link_position"]
+            for d in draws_of(w, sources)
+        ]
+    )
+    true = w.averaged["link_position"] - still.averaged["link_position"]
+    assert np.std(found) == pytest.approx(np.std(true), rel=0.25)
+
+
+def test_noise_of_a_bridged_record_is_bridged_as_its_readings_were() -> None:
+    """A cubic through a hole makes one error of many neighbours: twice differentiated it is a sixth
+    more than noise of as many samples. And rows count against the others of their record, as what
+    all of them lack is in that noise already.
+    """
+    rng = np.random.default_rng(8)
+    t, lost = 2e-3 * np.arange(20_000), rng.random(20_000) < 0.2
+    noise = 1e-5 * rng.standard_normal(len(t))
+    every = (slice(0, len(t)),)
+    read = bridged_over(np.sin(t) + noise, lost, every)
+    w = replace(prepare(t, {"motor_position": read}, every), lost=lost)
+    calm = prepare(t, {"motor_position": bridged_over(np.sin(t), lost, every)}, every)
+    drawn = {}
+    for name, seen in (("bridged", w), ("whole", replace(w, lost=None))):
+        (draw, *_) = draws_of(seen, {"motor_position": white(1e-5)})
+        drawn[name] = draw.noisy.averaged["motor_acceleration"]
+        drawn[name] = rms(drawn[name] - draw.calm.averaged["motor_acceleration"])
+    true = rms(w.averaged["motor_acceleration"] - calm.averaged["motor_acceleration"])
+    assert drawn["bridged"] == pytest.approx(true, rel=0.06)
+    assert drawn["whole"] < 0.95 * true
+    share = rng.uniform(0.4, 1.0, w.rows)
+    support = support_of([replace(w, support=share)])
+    np.testing.assert_allclose(support**2, share / share.mean())
 
 
 def test_a_jump_between_two_samples_is_seen_where_readings_are_interpolated() -> None:
