@@ -165,8 +165,8 @@ def test_an_inertia_that_only_noise_moves_is_told_by_no_record() -> None:
 
 @pytest.mark.slow
 def test_errors_beside_much_noise_cover() -> None:
-    """Of an inertia whose information is noise for the most part, and of the others beside it, for
-    which one window that held more than was certain made them up to nine times the value.
+    """Of an inertia whose information is noise for the most part, and of the others beside it: one
+    window that held more than was certain made them anything.
     """
     inside: dict[str, list[bool]] = {n: [] for n in NAMES}
     for seed in range(40):
