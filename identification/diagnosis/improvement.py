@@ -290,10 +290,13 @@ def spoilt(before: Error, after: Error) -> str:
     Balances are compared by their RMS on one weighting, common to both models. A floor alone
     refuses nothing: a balance is spoilt where its own RMS rises, and above what noise explains
     under the larger of both floors; and where it was noise and is none any more. A law that takes
-    over what a stiffness carries leaves less of the encoders' noise, and structure in it.
+    over what a stiffness carries leaves less of the encoders' noise, and structure in it. Noise
+    that the records do not hold once the law is there was none before: a ripple in a current reads
+    as noise of it until it is one.
     """
     for b, e in after.balances.items():
-        was = before.balances[b].ratio
+        old_one = before.balances[b]
+        was = old_one.ratio * max(old_one.believed / max(e.believed, 1e-300), 1.0)
         if was <= SPOILT_RATIO and e.ratio > RATIO_LIMIT:
             return (
                 f"what was noise in the {b} balance on held-out records ({was:.3g} times its "

@@ -185,6 +185,8 @@ def test_an_addition_is_judged_by_what_it_leaves_and_not_by_its_floor() -> None:
     # a floor that is lower because less is left than such noise: a ripple was read as noise
     assert judged_drop(error(0.9, 1.0), error(0.6, 0.65, 0.65), "motor") == pytest.approx(100 / 3)
     assert judged_drop(error(0.9, 1.0), error(0.3, 0.4, 0.8), "motor") == pytest.approx(100 / 3)
+    assert made_worse(error(0.9, 1.0), error(0.2, 0.05)).startswith("what was noise in the motor")
+    assert made_worse(error(0.9, 1.0), error(0.2, 0.05, 0.05)) == ""
     assert "motor" in made_worse(error(1.0, 0.01), error(1.3, 0.5))
     assert made_worse(error(0.1, 1.0), error(0.1, 1.0)) == ""
     assert made_worse(error(1.0, 0.5), error(1.05, 0.5)).startswith("the held-out error rises")
