@@ -295,8 +295,8 @@ def spoilt(before: Error, after: Error) -> str:
     as noise of it until it is one.
     """
     for b, e in after.balances.items():
-        old_one = before.balances[b]
-        was = old_one.ratio * max(old_one.believed / max(e.believed, 1e-300), 1.0)
+        first = before.balances[b]
+        was = first.ratio * max(first.believed / max(e.believed, 1e-300), 1.0)
         if was <= SPOILT_RATIO and e.ratio > RATIO_LIMIT:
             return (
                 f"what was noise in the {b} balance on held-out records ({was:.3g} times its "

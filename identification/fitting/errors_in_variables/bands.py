@@ -124,15 +124,15 @@ class Bands:
         gram = meeting.T @ scaled
         gram = (gram + gram.T) / 2
         added, pulled = noise.whole
-        certain = (gram, added / unit, level_error(problem.data))
-        whole = known(*certain)
+        given = (gram, added / unit, level_error(problem.data))
+        whole = known(*given)
         windows, tiled = self._windows
         grams, scores = noise.by_window(
             {b: np.asarray(w, dtype=np.float64) for b, w in problem.weights.items()},
             windows,
             {b: taking_part(b, problem.data.train) for b in problem.balances.balances},
         )
-        apart = WindowNoise(grams / unit, scores / norms, whole, kept(*certain))
+        apart = WindowNoise(grams / unit, scores / norms, whole, kept(*given))
         errors = window_errors(scaled, self._rows, tiled, apart, meeting)
         if errors is not None:
             # rows of the prior were made heavier by the share; they scatter as the prior does

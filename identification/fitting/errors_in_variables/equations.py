@@ -219,16 +219,19 @@ class _Equations:
         return all(after[b][0] <= before[b][0] * (1 + SURE_ERRORS * after[b][1]) for b in met)
 
     def no_more_than_noise(self, start: _Equations) -> bool:
-        """Whether the squares of all rows rose by no more than those of their noise did.
+        """Whether the squares of all rows grew by no more than their noise did.
 
         Without the noise they are smallest here. So what the rows of the least squares leave less
-        is noise that these pass on less: a damping at zero passes on none. Beside it the squares of
-        noise scatter, and its level is known to :data:`~identification.balance.colour.LEVEL_ERROR`.
+        is noise that these pass on less: a damping at zero passes on none. How much noise there is
+        is known badly where its tails are heavy, up to all that is left: so they may grow by the
+        factor by which it does, but for the scatter of a mean square, and by no more than
+        :data:`MOST_HIDDEN` times what noise there is.
         """
+        began, here = (float(x.rows @ x.rows) for x in (start, self))
         before, after = start.noise_squares, self.noise_squares
         scatter = SURE_ERRORS * math.sqrt(2 / max(INDEPENDENT_SHARE * len(self.rows), 1.0))
-        rise = float(self.rows @ self.rows - start.rows @ start.rows)
-        return rise <= (1 + LEVEL_ERROR) * max(after - before, 0.0) + scatter * after
+        factor = max(after / max(before, 1e-300), 1.0) + scatter
+        return here <= began * factor and here <= began + MOST_HIDDEN * after
 
     @property
     def noise_squares(self) -> float:
