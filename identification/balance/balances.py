@@ -163,6 +163,7 @@ class _Part:
             for j, slope in line.items():
                 slopes[i, j] = slope
         self._linear = ca.Function("linear", [parameters], [ca.densify(slopes)])
+        self._slopes: tuple[tuple[float, ...], FloatArray] = ((), np.empty(0))
         self.needed = [i for i, part in enumerate(zeroed) if not part.is_zero()]
         self._bent = {
             i: [n for n, d in zip(_NAMES, ca.which_depends(zeroed[i], signals), strict=True) if d]
@@ -185,7 +186,10 @@ class _Part:
         """Averages (rows, expressions and columns) with the internal states given at the points;
         `averaged` are those of the signals, (rows, signals).
         """
-        full: FloatArray = averaged @ np.array(self._linear(p)).T
+        slopes = self._slopes_at(p)
+        full: FloatArray = averaged @ slopes
+        if self._width > 1:  # to the last digit the same as without columns
+            full[:, :: self._width] = averaged @ np.ascontiguousarray(slopes[:, :: self._width])
         if self.needed:
             count = len(data.points["motor_position"])
             bent = average(self._rest.by_point(count, data.table(_NAMES), memory, p))
@@ -195,14 +199,25 @@ class _Part:
                 full[:, self.needed] += bent
         return full
 
+    def _slopes_at(self, p: Sequence[float]) -> FloatArray:
+        """What each signal is multiplied by, (signals, expressions and columns); not to be written
+        to. Draws of one record, and its balances, ask for the same values one after the other.
+        """
+        given = tuple(p)
+        known, slopes = self._slopes
+        if known != given or not slopes.size:
+            slopes = np.ascontiguousarray(np.array(self._linear(p)).T)
+            self._slopes = (given, slopes)
+        return slopes
+
     def slopes(self, balances: Sequence[str], p: Sequence[float]) -> dict[str, dict[str, float]]:
         """By balance, the signals that enter it linearly and how strongly."""
-        linear = np.array(self._linear(p))
+        linear = self._slopes_at(p)
         return {
             b: {
-                n: float(linear[i * self._width, j])
+                n: float(linear[j, i * self._width])
                 for j, n in enumerate(_NAMES)
-                if linear[i * self._width, j]
+                if linear[j, i * self._width]
             }
             for i, b in enumerate(balances)
         }
@@ -254,6 +269,7 @@ class Balances:
         self._tilted = _Part(model, tilted, columns, columns_only=columns_only) if tilted else None
         self._memory = Memory(model) if self._plain.remembers else None
         self._flight = Flight(model) if sensing.kinematic else None
+        self._columns_only = columns_only
         self._law = Law(model.structure)
         self.law = Law(model.structure, sensing, columns_only)
 
@@ -293,8 +309,13 @@ class Balances:
         def rows() -> FloatArray:
             return self._rows(data, self.memory_values(remembered or data, values), p)
 
-        full = rows() if self.wrt else residuals_of(data, (self.law, p), rows)
-        width = 1 + len(self.wrt)
+        width, law = 1 + len(self.wrt), (self.law, p)
+        if self.wrt:
+            full = rows()
+            if not self._columns_only:  # the residuals alone are asked for next
+                residuals_of(data, law, lambda: full[:, ::width].copy())
+        else:
+            full = residuals_of(data, law, rows)
         return {
             b: (full[:, i * width], full[:, i * width + 1 : (i + 1) * width])
             for i, b in enumerate(self.balances)

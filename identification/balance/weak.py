@@ -8,7 +8,7 @@ nonlinear are evaluated at the samples (velocities from a shorter kernel) and th
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any, Final, final
@@ -70,7 +70,7 @@ weighs a hundredth of its limit in the row, which is what noise leaves of it els
 taper, so that only rows whose edge touches a rest are near it."""
 
 STRETCH: Final = 4096
-"""Windows multiplied at a time: some hundred kilobytes."""
+"""Windows multiplied at a time: their products with the parts of a kernel take a few megabytes."""
 
 
 HALF: Final = 1e-6
@@ -206,11 +206,15 @@ class Grid:
 
     def correlate(self, values: FloatArray, weights: FloatArray) -> FloatArray:
         """Rows of a correlation of a full-rate signal with kernel weights."""
-        return _strided(values, weights, self.segments, self.half, self.stride)
+        return self.correlated(values, [weights])[0]
+
+    def correlated(self, values: FloatArray, kernels: Sequence[FloatArray]) -> list[FloatArray]:
+        """:meth:`correlate` with several kernels."""
+        return _correlated(values, kernels, self.segments, self.half, self.stride)
 
     def pick(self, values: FloatArray) -> FloatArray:
         """Full-rate values at the rows."""
-        return _strided(values, np.ones(1), self.segments, self.half, self.stride)
+        return self.correlate(values, np.ones(1))
 
 
 CANCELLED: Final = 1e-9
@@ -219,50 +223,74 @@ ROUNDED: Final = 1e-14
 """The same of a derivative: weights of a kernel fall off, so that some tens of terms count."""
 
 
-def _windows(values: FloatArray, length: int) -> FloatArray:
-    """All windows of that many samples, (windows, length), over the memory of the values: as the
-    view of numpy, which takes longer to make than a short record takes to be filtered.
+def _at(
+    values: FloatArray, kernels: Sequence[FloatArray], first: int, stride: int, count: int
+) -> list[FloatArray]:
+    """Correlations of a signal with kernels of one length, (count,) each: of the window that begins
+    at sample `first`, and of every `stride`-th one from there.
+
+    Kernels of a derivative see the differences of the samples: nothing at rest, where rounding of
+    the whole position would give a velocity of either sign. Steps of an encoder that cancel leave
+    rounding, too: it is zero.
     """
-    values = np.ascontiguousarray(values, dtype=np.float64)
-    apart = values.itemsize
-    return np.ndarray((len(values) - length + 1, length), np.float64, values, 0, (apart, apart))
-
-
-def _at(windows: FloatArray, where: IntArray, weights: FloatArray) -> FloatArray:
-    """Products of some windows with the weights, a stretch at a time: copies of all windows at once
-    would not stay in the cache.
-
-    Weights of a derivative see what is over the middle sample of each window: nothing at rest,
-    where rounding of the whole position would give a velocity of either sign. Steps of an encoder
-    that cancel leave rounding, too: it is zero.
-    """
-    out = np.empty(len(where))
-    size = float(np.abs(weights).sum())
-    derivative = abs(float(weights.sum())) < CANCELLED * size
-    middle = len(weights) // 2
-    for first in range(0, len(where), STRETCH):
-        part = where[first : first + STRETCH]
-        seen = windows[part]
-        if derivative:
-            seen -= seen[:, middle : middle + 1].copy()
-        own = out[first : first + STRETCH]
-        np.matmul(seen, weights, out=own)
-        if derivative:
-            reach = max(float(seen.max(initial=0.0)), -float(seen.min(initial=0.0)))
-            own[np.abs(own) <= ROUNDED * size * reach] = 0.0
+    derivative = [abs(float(w.sum())) < CANCELLED * float(np.abs(w).sum()) for w in kernels]
+    out = [np.empty(0)] * len(kernels)
+    for rate in sorted({*derivative}):
+        which = [i for i, d in enumerate(derivative) if d is rate]
+        x = np.diff(values) if rate else values
+        weights = np.array([-np.cumsum(kernels[i])[:-1] if rate else kernels[i] for i in which])
+        found = _blockwise(x, weights, first, stride, count)
+        reach = float(np.abs(x).max(initial=0.0)) if rate else 0.0
+        for i, w, own in zip(which, weights, found, strict=True):
+            if rate:
+                own[np.abs(own) <= ROUNDED * float(np.abs(w).sum()) * reach] = 0.0
+            out[i] = own
     return out
 
 
-def _strided(
-    values: FloatArray, weights: FloatArray, segments: tuple[slice, ...], half: int, stride: int
+def _blockwise(
+    values: FloatArray, weights: FloatArray, first: int, stride: int, count: int
 ) -> FloatArray:
-    own = len(weights) // 2
-    parts = []
-    for segment in segments:
-        x = values[segment]
-        rows = np.arange(half, len(x) - half, stride)
-        parts.append(_at(_windows(x, len(weights)), rows - own, weights))
-    return np.concatenate(parts) if parts else np.empty(0)
+    """Products of the windows with the weights (kernels, length), shape (kernels, count).
+
+    The signal is cut into blocks of a stride, each met once by every part of the weights: windows
+    overlap, and copies of them would take longer than the products.
+    """
+    parts = -(-weights.shape[1] // stride)
+    padded = np.zeros((len(weights), parts * stride))
+    padded[:, : weights.shape[1]] = weights
+    padded = padded.reshape(-1, stride)
+    out = np.zeros((len(weights), count))
+    for begin in range(0, count, STRETCH):
+        own = out[:, begin : begin + STRETCH]
+        blocks = np.zeros((own.shape[1] + parts - 1) * stride)
+        seen = values[first + begin * stride :][: len(blocks)]
+        blocks[: len(seen)] = seen
+        met = padded @ blocks.reshape(-1, stride).T
+        for k, row in enumerate(own):
+            for part in range(parts):
+                row += met[k * parts + part, part : part + len(row)]
+    return out
+
+
+def _correlated(
+    values: FloatArray,
+    kernels: Sequence[FloatArray],
+    segments: tuple[slice, ...],
+    half: int,
+    stride: int,
+) -> list[FloatArray]:
+    """Correlations with each kernel at the rows, those of one length at once."""
+    found: list[list[FloatArray]] = [[] for _ in kernels]
+    for length in {len(w): None for w in kernels}:
+        which = [i for i, w in enumerate(kernels) if len(w) == length]
+        for segment in segments:
+            x = values[segment]
+            count = len(range(half, len(x) - half, stride))
+            rows = _at(x, [kernels[i] for i in which], half - length // 2, stride, count)
+            for i, own in zip(which, rows, strict=True):
+                found[i].append(own)
+    return [np.concatenate(parts) if parts else np.empty(0) for parts in found]
 
 
 @final
@@ -660,7 +688,7 @@ def paired(grid: Grid, signals: Mapping[str, FloatArray]) -> dict[str, FloatArra
     if grid.torsion <= 0 or not set(PAIR) <= set(signals):
         return {}
     return {
-        c: _pointwise(signals[c], grid.segments, grid.torsion, grid.dt, 0, grid.step)[1]
+        c: _pointwise(signals[c], grid.segments, grid.torsion, grid.dt, 1, grid.step)[1][0]
         for c in PAIR
     }
 
@@ -699,40 +727,50 @@ def filtered(
     for source, chain in POSITION_CHAINS.items():
         if source not in signals:
             continue
-        for order, name in enumerate(chain):
-            averaged[name] = grid.correlate(
-                signals[source], differentiated_kernel(length, dt, order)
-            )
-            if curved and order + 2 <= HIGHEST_DERIVATIVE:
-                bent[name] = grid.correlate(
-                    signals[source], differentiated_kernel(length, dt, order + 2)
-                )
-            if source not in known:
-                points[name], smooth[name] = _pointwise(
-                    signals[source], grid.segments, short[source], dt, order, grid.step
-                )
+        signal, orders = signals[source], range(len(chain))
+        further = [o + 2 for o in orders if curved and o + 2 <= HIGHEST_DERIVATIVE]
+        kernels = [differentiated_kernel(length, dt, o) for o in (*orders, *further)]
+        rows = grid.correlated(signal, kernels)
+        averaged.update(zip(chain, rows, strict=False))
+        bent.update(zip(chain, rows[len(chain) :], strict=False))
+        if source not in known:
+            raw, soft = _pointwise(signal, grid.segments, short[source], dt, len(chain), grid.step)
+            points.update(zip(chain, raw, strict=True))
+            smooth.update(zip(chain, soft, strict=True))
     return averaged, points, smooth, bent
 
 
 def _pointwise(
-    values: FloatArray, segments: tuple[slice, ...], length: float, dt: float, order: int, step: int
-) -> tuple[FloatArray, FloatArray]:
-    """Raw (order 0) or smoothed derivative at every `step`-th sample; ends by the nearest full
-    window.
+    values: FloatArray,
+    segments: tuple[slice, ...],
+    length: float,
+    dt: float,
+    orders: int,
+    step: int,
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """A signal and its first derivatives, as many as there are `orders`, at every `step`-th sample:
+    the raw signal and smoothed derivatives, and all smoothed; ends by the nearest full window.
     """
-    weights = kernel(length, dt, order)
-    half = len(weights) // 2
-    raw, soft = [], []
-    for segment in segments:
-        x = values[segment]
-        inner = _windows(x, len(weights))
-        centres = np.clip(np.arange(0, len(x), step) - half, 0, len(inner) - 1)
-        filtered = _at(inner, centres, weights)
-        soft.append(filtered)
-        raw.append(x[::step] if order == 0 else filtered)
-    if not raw:
-        return np.empty(0), np.empty(0)
-    return np.concatenate(raw), np.concatenate(soft)
+    kernels = [kernel(length, dt, order) for order in range(orders)]
+    soft: list[list[FloatArray]] = [[] for _ in kernels]
+    for width in {len(w): None for w in kernels}:
+        which = [k for k, w in enumerate(kernels) if len(w) == width]
+        own = [kernels[k] for k in which]
+        for segment in segments:
+            x = values[segment]
+            starts = np.arange(0, len(x), step) - width // 2
+            before, last = int(np.sum(starts < 0)), len(x) - width
+            inside = int(np.sum((starts >= 0) & (starts <= last)))
+            after = len(starts) - before - inside
+            ends = (_at(x, own, 0, 1, 1), _at(x, own, last, 1, 1))
+            inner = _at(x, own, int(starts[before]), step, inside) if inside else [x[:0]] * len(own)
+            for k, low, middle, high in zip(which, ends[0], inner, ends[1], strict=True):
+                soft[k].append(
+                    np.concatenate([np.repeat(low, before), middle, np.repeat(high, after)])
+                )
+    smooth = [np.concatenate(parts) if parts else np.empty(0) for parts in soft]
+    raw = [np.concatenate([values[s][::step] for s in segments]) if segments else np.empty(0)]
+    return [*raw, *smooth[1:]], smooth
 
 
 def _blocks(

@@ -68,6 +68,10 @@ FARTHEST: Final = 2.0
 """Factor by which such a correction may move a scale: farther off its column is another one."""
 STEPS: Final = 3
 """Newton steps from the least squares: the products change little with the parameters."""
+SETTLED: Final = 1e-3
+"""Most by which the next step would move any combination of parameters, in standard errors of white
+rows, where there is no next step: rows on straight lines are there after the first.
+"""
 
 
 def unbiased(
@@ -271,11 +275,20 @@ class _Equations:
         for _ in range(STEPS):
             if not here.has_squares:  # it has run away, and no farther step is a number
                 break
-            problem = here.problem.moved(here.x + here.next_step(limits, moves))
-            with np.errstate(over="ignore", invalid="ignore"):  # there, which the next look ends
+            step = here.next_step(limits, moves)
+            with np.errstate(over="ignore", invalid="ignore"):  # the next look ends that
+                if here.hardly_moved_by(step):
+                    break
+                problem = here.problem.moved(here.x + step)
                 noise = noise_products(problem, met, believed=here.believed)
             here = replace(here, problem=problem, noise=noise, drawn=None)
         return here
+
+    def hardly_moved_by(self, step: FloatArray) -> bool:
+        """Whether a step (free,) changes the rows by no more than :data:`SETTLED`."""
+        change = float(np.linalg.norm(self.columns[0] @ step))
+        scatter = float(np.linalg.norm(self.rows)) / math.sqrt(len(self.rows))
+        return change <= SETTLED * scatter
 
     def next_step(
         self,

@@ -10,6 +10,8 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.balances import balances_of
+from identification.balance.calibration import bare
 from identification.balance.dataset import Dataset
 from identification.balance.drawn_noise import draws_of
 from identification.balance.stacked import Stacked, noise_believed, stack
@@ -97,13 +99,15 @@ DrawnRows = list[list[tuple[Stacked, Stacked]]]
 def drawn_rows(
     problem: WeakForm, read: Callable[[WeakRecord, WeakRecord], WeakRecord] | None = None
 ) -> DrawnRows:
-    """Rows and columns of a problem as noise is drawn, at its values; `read` makes of a drawn
-    record and its own what is looked at.
+    """Rows of a problem as noise is drawn, at its values, and the columns of those parameters that
+    do not bend them; `read` makes of a drawn record and its own what is looked at.
     """
+    straight = [n for n, bent in zip(problem.free, problem.bent, strict=True) if not bent]
+    balances = balances_of(problem.balances.model, problem.data.sensing, wrt=bare(straight))
 
     def rows(drawn: WeakRecord, record: WeakRecord) -> Stacked:
         seen = drawn if read is None else read(drawn, record)
-        return stack(problem.balances, [seen], problem.values, problem.free)
+        return stack(balances, [seen], problem.values, straight)
 
     return each_drawn(problem.data, rows)
 
@@ -150,7 +154,7 @@ def noise_products(
     believed : mapping of str to float, optional
         Of :func:`identification.balance.stacked.noise_believed`, where it is known.
     """
-    balances, data, straight = problem.balances, problem.data, ~problem.bent
+    balances, data, straight = problem.balances, problem.data, np.flatnonzero(~problem.bent)
     believed = believed or noise_believed(balances.model, data, problem.values)
     weights = {b: np.broadcast_to(problem.weights[b], (problem.rows,)) for b in balances.balances}
     found = moved_rows(own or drawn_rows(problem), data, weights, believed)
@@ -158,12 +162,13 @@ def noise_products(
     if met:
         others = drawn_rows(problem, lambda w, record: from_others(problem, w, record))
         theirs = moved_rows(others, data, weights, believed)
-    gram, score = {}, {}
+    size = len(problem.free)
+    gram, score = ({b: np.zeros(shape) for b in found} for shape in ((size, size), size))
     for b, rows in found.items():
-        moved = rows[:, :-1] * straight
-        by = theirs[b][:, :-1] * straight if b in met else moved
-        gram[b] = by.T @ moved
-        score[b] = by.T @ rows[:, -1]
+        moved = rows[:, :-1]
+        by = theirs[b][:, :-1] if b in met else moved
+        gram[b][np.ix_(straight, straight)] = by.T @ moved
+        score[b][straight] = by.T @ rows[:, -1]
     return NoiseProducts(gram, score)
 
 
