@@ -69,10 +69,6 @@ REST_SHARE: Final = 0.01
 weighs a hundredth of its limit in the row, which is what noise leaves of it elsewhere; the kernels
 taper, so that only rows whose edge touches a rest are near it."""
 
-STRETCH: Final = 4096
-"""Windows multiplied at a time: their products with the parts of a kernel take a few megabytes."""
-
-
 HALF: Final = 1e-6
 """Samples by which the last digits of a clock may miss a half: 60 ms hold 7.5 times 4 samples of
 2 ms, and a median step that is 1e-11 off would make 7 rows of 8.
@@ -253,24 +249,27 @@ def _blockwise(
 ) -> FloatArray:
     """Products of the windows with the weights (kernels, length), shape (kernels, count).
 
-    The signal is cut into blocks of a stride, each met once by every part of the weights: windows
-    overlap, and copies of them would take longer than the products.
+    The signal is cut into blocks about as long as a window. The windows that begin in a block end
+    in one of the next, and all of them are met at once: copies of windows, which overlap, would
+    take longer than the products.
     """
-    parts = -(-weights.shape[1] // stride)
-    padded = np.zeros((len(weights), parts * stride))
-    padded[:, : weights.shape[1]] = weights
-    padded = padded.reshape(-1, stride)
-    out = np.zeros((len(weights), count))
-    for begin in range(0, count, STRETCH):
-        own = out[:, begin : begin + STRETCH]
-        blocks = np.zeros((own.shape[1] + parts - 1) * stride)
-        seen = values[first + begin * stride :][: len(blocks)]
-        blocks[: len(seen)] = seen
-        met = padded @ blocks.reshape(-1, stride).T
-        for k, row in enumerate(own):
-            for part in range(parts):
-                row += met[k * parts + part, part : part + len(row)]
-    return out
+    kernels, length = weights.shape
+    held = max(1, round(length / stride))  # windows that begin in a block
+    size, blocks = held * stride, -(-count // held)
+    reached = -(-(length + size - stride) // size)
+    placed = np.zeros((reached * size, kernels, held))
+    for k in range(held):
+        placed[k * stride : k * stride + length, :, k] = weights.T
+    placed = placed.reshape(reached, size, kernels * held)
+    padded = np.zeros((blocks + reached - 1) * size)
+    seen = values[first : first + len(padded)]
+    padded[: len(seen)] = seen
+    signal = padded.reshape(-1, size)
+    out = signal[:blocks] @ placed[0]
+    for k in range(1, reached):
+        out += signal[k : k + blocks] @ placed[k]
+    by_kernel = out.reshape(blocks, kernels, held).transpose(1, 0, 2)
+    return np.ascontiguousarray(by_kernel.reshape(kernels, -1)[:, :count])
 
 
 def _correlated(
