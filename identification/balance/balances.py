@@ -16,7 +16,7 @@ import numpy.typing as npt
 from casadi_models import JointModel, Signals
 from casadi_models.affine import AffineParts
 from casadi_models.equations import swept
-from casadi_models.vectorised import Vectorised
+from casadi_models.vectorised import CHUNK, Vectorised
 from identification.balance.kinematic import kinematic_law
 from identification.balance.memory import Law, residuals_of, states_of
 from identification.balance.sensing import Sensing
@@ -191,13 +191,29 @@ class _Part:
         if self._width > 1:  # to the last digit the same as without columns
             full[:, :: self._width] = averaged @ np.ascontiguousarray(slopes[:, :: self._width])
         if self.needed:
-            count = len(data.points["motor_position"])
-            bent = average(self._rest.by_point(count, data.table(_NAMES), memory, p))
+            bent = self._averages(average, data, memory, p)
             if len(self.needed) == full.shape[1]:
                 full += bent
             else:
                 full[:, self.needed] += bent
         return full
+
+    def _averages(
+        self,
+        average: Callable[[FloatArray], FloatArray],
+        data: WeakRecord,
+        memory: FloatArray,
+        p: Sequence[float],
+    ) -> FloatArray:
+        """What is no straight line, averaged (rows, needed): some copies of a drawn record at a
+        time, so that what is averaged is still in the cache.
+        """
+        signals, found = data.table(_NAMES), []
+        for part in data.portions(CHUNK):
+            own = tuple(row[part] for row in signals)
+            rest = self._rest.by_point(part.stop - part.start, own, memory[:, part], p)
+            found.append(average(rest))
+        return found[0] if len(found) == 1 else np.concatenate(found)
 
     def _slopes_at(self, p: Sequence[float]) -> FloatArray:
         """What each signal is multiplied by, (signals, expressions and columns); not to be written

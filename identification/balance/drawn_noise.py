@@ -57,8 +57,8 @@ _kept = threading.local()
 
 @final
 @dataclass(frozen=True)
-class Draw:
-    """A record twice: with smoothed signals, and with drawn noise on top of them.
+class Draws:
+    """A record with smoothed signals, and with drawn noise on top of them.
 
     Attributes
     ----------
@@ -66,18 +66,23 @@ class Draw:
         The record itself, or pieces of it where it is long.
     rows : (n,) int array
         Rows of the whole record that these are.
-    calm, noisy : WeakRecord
-        All draws of a record have the same calm one.
+    calm : WeakRecord
+        With smoothed signals.
+    noisy : WeakRecord
+        `count` copies of that one after the other, each with other noise.
+    count : int
     """
 
     record: WeakRecord
     rows: IntArray
     calm: WeakRecord
     noisy: WeakRecord
+    count: int
 
 
-def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Draw, ...]:
-    """Draws of the noise on the channels of a record, kept for the records that asked last.
+def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> Draws:
+    """Draws of the noise on the channels of a record, kept for the records that asked last; as many
+    as give :data:`ROWS` rows.
 
     Parameters
     ----------
@@ -85,27 +90,19 @@ def draws_of(record: WeakRecord, noise: Mapping[str, ChannelNoise]) -> tuple[Dra
         Held weakly, known by identity.
     noise : mapping of str to ChannelNoise
         Of each measured signal.
-
-    Returns
-    -------
-    tuple of Draw
-        As many as give :data:`ROWS` rows.
     """
-    cache: OrderedDict[Hashable, tuple[weakref.ref[WeakRecord], tuple[Draw, ...]]] = (
-        _kept.__dict__.setdefault("draws", OrderedDict())
+    cache: OrderedDict[Hashable, tuple[weakref.ref[WeakRecord], Draws]] = _kept.__dict__.setdefault(
+        "draws", OrderedDict()
     )
     key = (id(record), tuple(sorted(noise.items(), key=lambda item: item[0])))
     found = cache.get(key)
     if found is not None and found[0]() is record:
         cache.move_to_end(key)
         return found[1]
-    rng = np.random.default_rng(SEED)
     seen, rows = excerpt(record)
     calm = replace(seen, points={**seen.points, **seen.smooth})
-    made = tuple(
-        Draw(seen, rows, calm, noisy=_with_noise(calm, noise, rng))
-        for _ in range(max(1, -(-ROWS // max(seen.rows, 1))))
-    )
+    count = max(1, -(-ROWS // max(seen.rows, 1)))
+    made = Draws(seen, rows, calm, _with_noise(calm, noise, count), count)
     cache[key] = (weakref.ref(record), made)
     while len(cache) > MOST:
         cache.popitem(last=False)
@@ -186,35 +183,47 @@ def excerpt(record: WeakRecord) -> tuple[WeakRecord, IntArray]:
     return pieces, which
 
 
-def _with_noise(
-    record: WeakRecord, noise: Mapping[str, ChannelNoise], rng: np.random.Generator
-) -> WeakRecord:
-    """A record, its points smoothed already, with drawn noise on top of it."""
-    grid = record.grid
+def _with_noise(record: WeakRecord, noise: Mapping[str, ChannelNoise], copies: int) -> WeakRecord:
+    """Copies of a record, its points smoothed already, with drawn noise on top of it."""
+    grid, rng = record.grid, np.random.default_rng(SEED)
     count = max((s.stop for s in grid.segments), default=0)
     present = [
         c for c in POSITION_CHAINS if c in noise and noise[c].level > 0 and c in record.points
     ]
-    drawn = {
-        c: noise[c].rounding(rng, _course(record, c, noise, count))
-        if noise[c].step > 0
-        else noise[c].draw(rng, count, grid.dt)
-        for c in present
-    }
-    for c in present:
-        if record.lost is not None:
-            drawn[c] = bridged_over(drawn[c], record.lost[:count], grid.segments)
-        if c in record.bridging:  # what bridges are off by, after the noise: its draws stay
-            drawn[c] = drawn[c] + record.bridging[c][:count] * rng.standard_normal(count)
+    courses = {c: _course(record, c, noise, count) for c in present if noise[c].step > 0}
+    drawn = {c: np.empty((copies, count)) for c in present}
+    for copy in range(copies):
+        for c in present:
+            drawn[c][copy] = (
+                noise[c].rounding(rng, courses[c])
+                if c in courses
+                else noise[c].draw(rng, count, grid.dt)
+            )
+        for c in present:
+            own = drawn[c][copy]
+            if record.lost is not None:
+                own[:] = bridged_over(own, record.lost[:count], grid.segments)
+            if c in record.bridging:  # what bridges are off by, after the noise: its draws stay
+                own += record.bridging[c][:count] * rng.standard_normal(count)
     averaged, points, smooth, curved = filtered(grid, drawn, curved=bool(record.curved))
-    also = paired(grid, {c: drawn.get(c, np.zeros(count)) for c in record.paired})
+    zero = np.zeros((copies, count))
+    also = paired(grid, {c: drawn.get(c, zero) for c in record.paired})
+    first = record.starts[-1] * np.arange(copies)[:, None] + record.starts[:-1]
     return replace(
         record,
-        averaged=_plus(record.averaged, averaged),
-        points=_plus(record.points, points),
-        smooth=_plus(record.smooth, smooth),
-        paired=_plus(record.paired, also),
-        curved=_plus(record.curved, curved),
+        averaged=_plus(record.averaged, averaged, copies),
+        points=_plus(record.points, points, copies),
+        smooth=_plus(record.smooth, smooth, copies),
+        paired=_plus(record.paired, also, copies),
+        curved=_plus(record.curved, curved, copies),
+        doubts=tuple(_plus(d, {}, copies) for d in record.doubts),
+        rest=_plus(record.rest, {}, copies),
+        between=_plus(record.between, {}, copies),
+        time=np.tile(record.time, copies),
+        block=np.tile(record.block, copies),
+        starts=np.append(first.ravel(), copies * record.starts[-1]),
+        support=None if record.support is None else np.tile(record.support, copies),
+        copies=copies,
     )
 
 
@@ -264,9 +273,12 @@ def _slow(apart: FloatArray, course: FloatArray, step: float, dt: float) -> Floa
 
 
 def _plus(
-    signals: Mapping[str, FloatArray], noise: Mapping[str, FloatArray]
+    signals: Mapping[str, FloatArray], noise: Mapping[str, FloatArray], copies: int
 ) -> dict[str, FloatArray]:
-    return {n: x + noise[n] if n in noise else x for n, x in signals.items()}
+    """Copies of signals (n,) one after the other, each with its own noise (copies, n)."""
+    return {
+        n: (x + noise[n]).ravel() if n in noise else np.tile(x, copies) for n, x in signals.items()
+    }
 
 
-__all__ = ["Draw", "draws_of", "excerpt"]
+__all__ = ["Draws", "draws_of", "excerpt"]

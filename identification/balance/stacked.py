@@ -87,6 +87,23 @@ class Stacked:
         """Residuals for pictures: NaN in rows that take no part."""
         return {b: np.where(self.taking[b], r, np.nan) for b, r in self.residual.items()}
 
+    def parts(self, count: int) -> list[Stacked]:
+        """As many equal parts, one after the other."""
+        size = len(self.block) // count
+
+        def cut(rows: Mapping[str, Any], k: int) -> dict[str, Any]:
+            return {b: x[k * size : (k + 1) * size] for b, x in rows.items()}
+
+        return [
+            Stacked(
+                cut(self.residual, k),
+                cut(self.jacobian, k),
+                self.block[k * size : (k + 1) * size],
+                cut(self.taking, k),
+            )
+            for k in range(count)
+        ]
+
 
 def stack(
     balances: Balances,
@@ -226,19 +243,19 @@ def _drawn_floors(
 ) -> dict[str, float]:
     power = dict.fromkeys(balances.balances, 0.0)
     drawn = draws_of(record, {c: noise.without_drift for c, noise in data.sources.items()})
-    seen = drawn[0].record
+    seen = drawn.record
     either = unsure(balances, data, values, [seen])
     values = values_on(balances.model, record, values)
-    calm = balances.evaluate(drawn[0].calm, values, remembered=seen)
-    for draw in drawn:
-        noisy = balances.evaluate(draw.noisy, values)
-        for b in power:
-            rows = seen.taking(b)
-            power[b] += _sure_rms((noisy[b][0] - calm[b][0])[rows], either[b][rows]) ** 2
+    calm = balances.evaluate(drawn.calm, values, remembered=seen)
+    noisy = balances.evaluate(drawn.noisy, values)
+    for b in power:
+        rows = seen.taking(b)
+        for moved in noisy[b][0].reshape(drawn.count, -1) - calm[b][0]:
+            power[b] += _sure_rms(moved[rows], either[b][rows]) ** 2
     slow = _drifts(balances, data, values, record)
     return {
         b: math.hypot(
-            math.sqrt(p / len(drawn)), rms(slow[b][record.taking(b)]) if b in slow else 0.0
+            math.sqrt(p / drawn.count), rms(slow[b][record.taking(b)]) if b in slow else 0.0
         )
         for b, p in power.items()
     }
@@ -420,13 +437,10 @@ def _drawn_rests(
 ) -> dict[str, FloatArray]:
     """What drawn noise makes of the rests of :func:`slow_noise_beside`, (draws, rows) each."""
     own = values_on(model, record, values)
-    made: dict[str, list[FloatArray]] = {}
-    for draw in draws_of(record, sources):
-        noisy, calm = (balances.evaluate(w, own) for w in (draw.noisy, draw.calm))
-        rests = _rests_of({b: noisy[b][0] - calm[b][0] for b in noisy})
-        for key, rows in rests.items():
-            made.setdefault(key, []).append(rows)
-    return {key: np.stack(rows) for key, rows in made.items()}
+    draws = draws_of(record, sources)
+    noisy, calm = (balances.evaluate(w, own) for w in (draws.noisy, draws.calm))
+    shape = (draws.count, -1)
+    return _rests_of({b: noisy[b][0].reshape(shape) - calm[b][0] for b in noisy})
 
 
 def _rests_of(rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:

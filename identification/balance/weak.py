@@ -205,7 +205,8 @@ class Grid:
         return self.correlated(values, [weights])[0]
 
     def correlated(self, values: FloatArray, kernels: Sequence[FloatArray]) -> list[FloatArray]:
-        """:meth:`correlate` with several kernels."""
+        """:meth:`correlate` of signals (..., samples) with several kernels, (..., rows) each."""
+        values = np.asarray(values, dtype=np.float64)
         return _correlated(values, kernels, self.segments, self.half, self.stride)
 
     def pick(self, values: FloatArray) -> FloatArray:
@@ -220,23 +221,23 @@ ROUNDED: Final = 1e-14
 
 
 def _at(
-    values: FloatArray, kernels: Sequence[FloatArray], first: int, stride: int, count: int
+    signals: FloatArray, kernels: Sequence[FloatArray], first: int, stride: int, count: int
 ) -> list[FloatArray]:
-    """Correlations of a signal with kernels of one length, (count,) each: of the window that begins
-    at sample `first`, and of every `stride`-th one from there.
+    """Correlations of signals (signals, samples) with kernels of one length, (signals, count) each:
+    of the window that begins at sample `first`, and of every `stride`-th one from there.
 
     Kernels of a derivative see the differences of the samples: nothing at rest, where rounding of
     the whole position would give a velocity of either sign. Steps of an encoder that cancel leave
     rounding, too: it is zero.
     """
     derivative = [abs(float(w.sum())) < CANCELLED * float(np.abs(w).sum()) for w in kernels]
-    out = [np.empty(0)] * len(kernels)
+    out = [np.empty((0, 0))] * len(kernels)
     for rate in sorted({*derivative}):
         which = [i for i, d in enumerate(derivative) if d is rate]
-        x = np.diff(values) if rate else values
+        x = np.diff(signals) if rate else signals
         weights = np.array([-np.cumsum(kernels[i])[:-1] if rate else kernels[i] for i in which])
         found = _blockwise(x, weights, first, stride, count)
-        reach = float(np.abs(x).max(initial=0.0)) if rate else 0.0
+        reach = np.abs(x).max(axis=1, initial=0.0, keepdims=True) if rate else 0.0
         for i, w, own in zip(which, weights, found, strict=True):
             if rate:
                 own[np.abs(own) <= ROUNDED * float(np.abs(w).sum()) * reach] = 0.0
@@ -245,13 +246,14 @@ def _at(
 
 
 def _blockwise(
-    values: FloatArray, weights: FloatArray, first: int, stride: int, count: int
+    signals: FloatArray, weights: FloatArray, first: int, stride: int, count: int
 ) -> FloatArray:
-    """Products of the windows with the weights (kernels, length), shape (kernels, count).
+    """Products of the windows of signals (signals, samples) with the weights (kernels, length),
+    shape (kernels, signals, count).
 
-    The signal is cut into blocks about as long as a window. The windows that begin in a block end
-    in one of the next, and all of them are met at once: copies of windows, which overlap, would
-    take longer than the products.
+    A signal is cut into blocks about as long as a window. The windows that begin in a block end in
+    one of the next, and all of them are met at once: copies of windows, which overlap, would take
+    longer than the products.
     """
     kernels, length = weights.shape
     held = max(1, round(length / stride))  # windows that begin in a block
@@ -261,35 +263,44 @@ def _blockwise(
     for k in range(held):
         placed[k * stride : k * stride + length, :, k] = weights.T
     placed = placed.reshape(reached, size, kernels * held)
-    padded = np.zeros((blocks + reached - 1) * size)
-    seen = values[first : first + len(padded)]
-    padded[: len(seen)] = seen
-    signal = padded.reshape(-1, size)
-    out = signal[:blocks] @ placed[0]
+    padded = np.zeros((len(signals), (blocks + reached - 1) * size))
+    seen = signals[:, first : first + padded.shape[1]]
+    padded[:, : seen.shape[1]] = seen
+    cut = padded.reshape(len(signals), -1, size)
+    out = cut[:, :blocks] @ placed[0]
     for k in range(1, reached):
-        out += signal[k : k + blocks] @ placed[k]
-    by_kernel = out.reshape(blocks, kernels, held).transpose(1, 0, 2)
-    return np.ascontiguousarray(by_kernel.reshape(kernels, -1)[:, :count])
+        out += cut[:, k : k + blocks] @ placed[k]
+    by_kernel = out.reshape(len(signals), blocks, kernels, held).transpose(2, 0, 1, 3)
+    return np.ascontiguousarray(by_kernel.reshape(kernels, len(signals), -1)[..., :count])
 
 
 def _correlated(
-    values: FloatArray,
+    signals: FloatArray,
     kernels: Sequence[FloatArray],
     segments: tuple[slice, ...],
     half: int,
     stride: int,
 ) -> list[FloatArray]:
-    """Correlations with each kernel at the rows, those of one length at once."""
+    """Correlations of signals (..., samples) with each kernel at the rows, (..., rows); those of
+    one length at once.
+    """
+    flat = signals.reshape(-1, signals.shape[-1])
     found: list[list[FloatArray]] = [[] for _ in kernels]
     for length in {len(w): None for w in kernels}:
         which = [i for i, w in enumerate(kernels) if len(w) == length]
         for segment in segments:
-            x = values[segment]
-            count = len(range(half, len(x) - half, stride))
+            x = flat[:, segment]
+            count = len(range(half, x.shape[1] - half, stride))
             rows = _at(x, [kernels[i] for i in which], half - length // 2, stride, count)
             for i, own in zip(which, rows, strict=True):
                 found[i].append(own)
-    return [np.concatenate(parts) if parts else np.empty(0) for parts in found]
+    return [_joined(parts, signals) for parts in found]
+
+
+def _joined(parts: Sequence[FloatArray], like: FloatArray) -> FloatArray:
+    """Parts (signals, some) one after the other, in the shape of signals (..., samples)."""
+    whole = np.concatenate(parts, axis=1) if parts else np.empty((like[..., 0].size, 0))
+    return whole.reshape(*like.shape[:-1], -1) if whole.size else np.empty((*like.shape[:-1], 0))
 
 
 @final
@@ -363,6 +374,8 @@ class WeakRecord:
         By the place of a late sensor, the samples that are taken off its readings already [s].
     filters : mapping of str to Filter
         By the place of a sensor that may be read through a low-pass, what the record says of it.
+    copies : int
+        So many times the stretches of the grid, one after the other: noise drawn so often.
     """
 
     grid: Grid
@@ -384,6 +397,7 @@ class WeakRecord:
     bridging: Mapping[str, FloatArray] = field(default_factory=dict)
     lost: npt.NDArray[np.bool_] | None = None
     filters: Mapping[str, Filter] = field(default_factory=dict)
+    copies: int = 1
 
     def __repr__(self) -> str:
         return one_line(self)
@@ -435,21 +449,21 @@ class WeakRecord:
         -------
         (rows,) or (rows, columns) array
         """
-        return np.asarray(self.averaging @ values, dtype=np.float64)
+        return self._each(self.averaging, values)
 
     def curve(self, values: FloatArray) -> FloatArray:
         """Second derivative of the kernel average of values at the points (shapes as in
         :meth:`average`).
         """
-        return np.asarray(self.curving @ values, dtype=np.float64)
+        return self._each(self.curving, values)
 
     def tilt(self, values: FloatArray) -> FloatArray:
         """Rate of the kernel average of values at the points (shapes as in :meth:`average`)."""
-        return np.asarray(self.tilting @ values, dtype=np.float64)
+        return self._each(self.tilting, values)
 
     @cached_property
     def averaging(self) -> Any:
-        """Sparse matrix (rows, points) of the kernel average."""
+        """Sparse matrix (rows, points) of the kernel average, of one copy."""
         return self._sparse(0)
 
     @cached_property
@@ -508,11 +522,29 @@ class WeakRecord:
     def _tables(self) -> dict[tuple[str, tuple[str, ...]], FloatArray]:
         return {}
 
+    def portions(self, most: int) -> list[slice]:
+        """Points of so many copies at a time as have no more than `most` points; one at least."""
+        size = int(self.starts[-1]) // self.copies
+        some = max(1, most // max(size, 1))
+        return [
+            slice(first * size, min(first + some, self.copies) * size)
+            for first in range(0, self.copies, some)
+        ]
+
+    @staticmethod
+    def _each(matrix: Any, values: FloatArray) -> FloatArray:
+        """Rows of a matrix of the grid, of every copy by itself."""
+        copies = len(values) // matrix.shape[1]
+        if copies == 1:
+            return np.asarray(matrix @ values, dtype=np.float64)
+        return np.concatenate([matrix @ part for part in np.split(values, copies)])
+
     def _sparse(self, order: int) -> Any:
         grid = self.grid
         half, stride = grid.half // grid.step, grid.stride // grid.step
         kernel_of = (grid.length, grid.dt, order, grid.step)
-        return _averages(kernel_of, half, stride, tuple(self.starts.tolist()))
+        starts = self.starts[: (len(self.starts) - 1) // self.copies + 1]
+        return _averages(kernel_of, half, stride, tuple(starts.tolist()))
 
     @property
     def rows(self) -> int:
@@ -706,7 +738,7 @@ def filtered(
     Parameters
     ----------
     grid : Grid
-    signals : mapping
+    signals : mapping of str to (..., samples) array
         Keys of :data:`POSITION_CHAINS`, full rate; other keys are left out.
     curved : bool
         Second derivatives of the averages too.
@@ -740,36 +772,40 @@ def filtered(
 
 
 def _pointwise(
-    values: FloatArray,
+    signals: FloatArray,
     segments: tuple[slice, ...],
     length: float,
     dt: float,
     orders: int,
     step: int,
 ) -> tuple[list[FloatArray], list[FloatArray]]:
-    """A signal and its first derivatives, as many as there are `orders`, at every `step`-th sample:
-    the raw signal and smoothed derivatives, and all smoothed; ends by the nearest full window.
+    """Signals (..., samples) and their first derivatives, as many as there are `orders`, at every
+    `step`-th sample, (..., points) each: raw signals and smoothed derivatives, and all smoothed;
+    ends by the nearest full window.
     """
+    signals = np.asarray(signals, dtype=np.float64)
+    flat = signals.reshape(-1, signals.shape[-1])
     kernels = [kernel(length, dt, order) for order in range(orders)]
     soft: list[list[FloatArray]] = [[] for _ in kernels]
     for width in {len(w): None for w in kernels}:
         which = [k for k, w in enumerate(kernels) if len(w) == width]
         own = [kernels[k] for k in which]
         for segment in segments:
-            x = values[segment]
-            starts = np.arange(0, len(x), step) - width // 2
-            before, last = int(np.sum(starts < 0)), len(x) - width
-            inside = int(np.sum((starts >= 0) & (starts <= last)))
-            after = len(starts) - before - inside
-            ends = (_at(x, own, 0, 1, 1), _at(x, own, last, 1, 1))
-            inner = _at(x, own, int(starts[before]), step, inside) if inside else [x[:0]] * len(own)
-            for k, low, middle, high in zip(which, ends[0], inner, ends[1], strict=True):
-                soft[k].append(
-                    np.concatenate([np.repeat(low, before), middle, np.repeat(high, after)])
-                )
-    smooth = [np.concatenate(parts) if parts else np.empty(0) for parts in soft]
-    raw = [np.concatenate([values[s][::step] for s in segments]) if segments else np.empty(0)]
-    return [*raw, *smooth[1:]], smooth
+            x = flat[:, segment]
+            last = x.shape[1] - width
+            starts = np.arange(0, x.shape[1], step) - width // 2
+            inside = np.flatnonzero((starts >= 0) & (starts <= last))
+            before = int(np.sum(starts < 0))
+            after = len(starts) - before - len(inside)
+            low, high = (_at(x, own, first, 1, 1) for first in (0, last))
+            begin = int(starts[inside[0]]) if len(inside) else 0
+            middle = _at(x, own, begin, step, len(inside))
+            for k, *parts in zip(which, low, middle, high, strict=True):
+                soft[k].append(np.repeat(parts[0], before, axis=1))
+                soft[k] += [parts[1], np.repeat(parts[2], after, axis=1)]
+    smooth = [_joined(parts, signals) for parts in soft]
+    raw = _joined([flat[:, s][:, ::step] for s in segments], signals)
+    return [raw, *smooth[1:]], smooth
 
 
 def _blocks(

@@ -117,8 +117,8 @@ def each_drawn(data: Dataset, rows: Callable[[WeakRecord, WeakRecord], Stacked])
     found: DrawnRows = []
     for record in data.train:
         draws = draws_of(record, data.sources)
-        calm = rows(draws[0].calm, record)
-        found.append([(calm, rows(d.noisy, record)) for d in draws])
+        calm, noisy = (rows(w, record) for w in (draws.calm, draws.noisy))
+        found.append([(calm, part) for part in noisy.parts(draws.count)])
     return found
 
 
@@ -126,7 +126,8 @@ def level_error(data: Dataset) -> float:
     """Standard error of the squares that noise adds to a direction, as a share of them: of the
     noise that is in the training rows, and of the one that is drawn.
     """
-    drawn = sum(len(d.rows) for record in data.train for d in draws_of(record, data.sources))
+    draws = [draws_of(record, data.sources) for record in data.train]
+    drawn = sum(d.count * len(d.rows) for d in draws)
     rows = min(sum(int(w.taking(b).sum()) for w in data.train) for b in data.sensing.balances)
     return math.sqrt(sum(2 / (INDEPENDENT_SHARE * max(n, 1)) for n in (drawn, rows)))
 
@@ -196,12 +197,13 @@ def moved_rows(
     for record, pairs in zip(data.train, drawn, strict=True):
         rows = slice(first, first + record.rows)
         first = rows.stop
-        for draw, (calm, noisy) in zip(draws_of(record, data.sources), pairs, strict=True):
+        drawn_of = draws_of(record, data.sources).rows
+        for calm, noisy in pairs:
             for b, given in weights.items():
                 squares = given[rows] ** 2 * record.taking(b)
                 # pieces of a long record stand for all of it
-                whole = np.sum(squares) / max(float(np.sum(squares[draw.rows])), 1e-300)
-                weight = given[rows][draw.rows] * (believed[b] * np.sqrt(whole / len(pairs)))
+                whole = np.sum(squares) / max(float(np.sum(squares[drawn_of])), 1e-300)
+                weight = given[rows][drawn_of] * (believed[b] * np.sqrt(whole / len(pairs)))
                 moved = np.column_stack(
                     [noisy.jacobian[b] - calm.jacobian[b], noisy.residual[b] - calm.residual[b]]
                 )
