@@ -250,8 +250,8 @@ def _drawn_floors(
     noisy = balances.evaluate(drawn.noisy, values)
     for b in power:
         rows = seen.taking(b)
-        for moved in noisy[b][0].reshape(drawn.count, -1) - calm[b][0]:
-            power[b] += _sure_rms(moved[rows], either[b][rows]) ** 2
+        moved = (noisy[b][0].reshape(drawn.count, -1) - calm[b][0])[:, rows]
+        power[b] = float(np.sum(_sure_rms_of_each(moved, either[b][rows]) ** 2))
     slow = _drifts(balances, data, values, record)
     return {
         b: math.hypot(
@@ -466,21 +466,29 @@ def _sure_rms(change: FloatArray, either: FloatArray) -> float:
     """RMS in which rows that may go either way count by how sure they are, beside that RMS
     itself: as in every fit.
     """
-    if not len(change):
-        return 0.0
-    level = float(np.median(np.abs(change))) / NORMAL_MEDIAN
-    if level <= 0 or not np.any(either):
-        return rms(change)
+    return float(_sure_rms_of_each(change[None], either)[0])
+
+
+def _sure_rms_of_each(change: FloatArray, either: FloatArray) -> FloatArray:
+    """:func:`_sure_rms` of each of several changes (changes, rows)."""
+    if not change.shape[1]:
+        return np.zeros(len(change))
+    out = np.array([rms(c) for c in change])
+    level = np.median(np.abs(change), axis=1) / NORMAL_MEDIAN
+    moving = np.flatnonzero(level > 0) if np.any(either) else np.arange(0)
     either = np.minimum(either, NOTHING_SURE)
+    out[moving] = level[moving]
     for _ in range(WEIGHINGS):
-        # from the surest row: where a law ran away the square of each alone may be nothing
-        unsure_by = np.hypot(level, either)
-        weight = float(unsure_by.min()) / unsure_by
-        weighted, before = change * weight, level
-        level = math.sqrt(float(weighted @ weighted) / float(weight @ weight))
-        if level == before or not math.isfinite(level):
+        if not len(moving):
             break
-    return level
+        # from the surest row: where a law ran away the square of each alone may be nothing
+        unsure_by = np.hypot(out[moving, None], either)
+        weight = unsure_by.min(axis=1, keepdims=True) / unsure_by
+        weighted, before = change[moving] * weight, out[moving]
+        squares = np.einsum("kn,kn->k", weighted, weighted)
+        out[moving] = np.sqrt(squares / np.einsum("kn,kn->k", weight, weight))
+        moving = moving[(out[moving] != before) & np.isfinite(out[moving])]
+    return out
 
 
 def sure_levels(model: JointModel, data: Dataset, values: Mapping[str, float]) -> dict[str, float]:
