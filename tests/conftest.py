@@ -48,9 +48,42 @@ have done all the rest keeps the suite waiting. Those of the browser, which wait
 their time, stand between those that calculate."""
 
 
+WIDE = (
+    "test_user_fmu_track.py",
+    "test_user_fmu_batch.py",
+    "test_user_fmu_explore.py",
+    "test_native_twin.py::test_equals_python_at_coarse",
+    "test_native_twin.py::test_equals_python_for_other_joints",
+    "test_native_twin.py::test_the_step_is_that_of_the_records",
+    "test_native_fmi3.py::test_every_output",
+    "test_app_charts.py",
+    "test_app_clumsy.py",
+    "test_app_draft.py",
+    "test_import_browser.py",
+    "test_sensor_sets.py",
+    "test_clocks.py::test_a_torque_beside",
+    "test_clocks.py::test_part_of_a_sample",
+    "test_changed.py::test_changes_are_told_with_fewer_sensors",
+    "test_changed.py::test_changes_planted",
+    "test_learned.py::test_what_only_longer_rows_show",
+    "test_learned.py::test_the_loop",
+    "test_lines.py::test_line_",
+    "test_slow_noise.py::test_what_a_drift_foretells",
+    "test_metamorphic.py::test_the_same_is_named",
+    "test_left_open.py",
+    "test_next_run.py",
+    "test_examples.py::test_each_joint",
+)
+"""Files and tests that look at more joints, hosts, sensor sets or views for what others of the same
+subject hold already: where a machine is slow, `.ci/run` leaves them to another one, and says so."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest files first, in this order, all others as they were collected."""
     place = {name: k for k, name in enumerate(LONGEST)}
+    for item in items:
+        if item.nodeid.rpartition("/")[2].startswith(WIDE):
+            item.add_marker("wide")
     items.sort(key=lambda item: place.get(item.path.name, len(LONGEST)))
 
 
