@@ -83,8 +83,10 @@ WIDE = (
     "test_next_run.py",
     "test_examples.py::test_each_joint",
 )
-"""Files and tests that look at more joints, hosts, sensor sets or views for what others of the same
-subject hold already: where a machine is slow, `.ci/run` leaves them to another one, and says so."""
+"""Files and tests that `.ci/run` runs last, where a machine has time for them, and says so where it
+has not. Most look at more joints, hosts, sensor sets or views for what others hold already; some
+are all that there is of a subject (an FMU that is tracked, the next run, a delay of the drive) and
+stand here because they take long."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

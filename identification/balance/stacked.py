@@ -473,11 +473,10 @@ def _sure_rms_of_each(change: FloatArray, either: FloatArray) -> FloatArray:
     """:func:`_sure_rms` of each of several changes (changes, rows)."""
     if not change.shape[1]:
         return np.zeros(len(change))
-    out = np.array([rms(c) for c in change])
-    level = np.median(np.abs(change), axis=1) / NORMAL_MEDIAN
-    moving = np.flatnonzero(level > 0) if np.any(either) else np.arange(0)
-    either = np.minimum(either, NOTHING_SURE)
-    out[moving] = level[moving]
+    out = np.median(np.abs(change), axis=1) / NORMAL_MEDIAN
+    weighed = out > 0 if np.any(either) else np.zeros(len(out), dtype=np.bool_)
+    out[~weighed] = [rms(c) for c in change[~weighed]]
+    moving, either = np.flatnonzero(weighed), np.minimum(either, NOTHING_SURE)
     for _ in range(WEIGHINGS):
         if not len(moving):
             break
