@@ -23,6 +23,7 @@ from identification.online.first_window import (
     fast_recursion,
     first_estimate,
     prior_range,
+    told_beside_noise,
 )
 from identification.online.grid import Grid
 from identification.online.guard import Guard
@@ -517,6 +518,8 @@ class OnlineEstimator:
         """Start the recursion from the collected rows."""
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
         self._set(torque=self._now.torque / len(y))
+        period, noise = self.rows.timing.stride * self.dt, self._entry_noise()
+        y, h, entries = told_beside_noise(y, h, self.theta, noise, period)
         least = np.maximum(self.options.floor_share * np.sqrt(self._now.torque), LEAST)
         first, weight = first_estimate(
             y, h, least, self.rows.like, partial(self._weight_of, shares)
@@ -526,6 +529,7 @@ class OnlineEstimator:
         self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual, self.rows.like))
         self.estimator = self.recursion(self.theta)
         started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
+        self.estimator.set_entry_noise(noise, entries)
         if started.undetermined:
             names = ", ".join(self.names[i] for i in started.undetermined)
             self._tell(f"not determined by the first window: {names}")
@@ -539,11 +543,14 @@ class OnlineEstimator:
         if self.two_step is not None and not self.two_step.known:
             self._launch(self.two_step, first=True)
 
+    def _entry_noise(self) -> FloatArray:
+        """Variance of the noise in the entries of a row now, (balances, parameters)."""
+        return self.rows.entry_noise(self.watch.noise[list(SAMPLED)])
+
     def _factory(self) -> Callable[[FloatArray, FloatArray], RecursiveLeastSquares]:
         """(values, scale) -> recursive least squares with the present options."""
-        period = self.rows.timing.stride * self.dt
         settings = Settings(
-            sample_time=period,
+            sample_time=self.rows.timing.stride * self.dt,
             drift=self.options.drift,
             alarm_drift=self.options.alarm_drift,
             window_seconds=2.0,
@@ -569,6 +576,7 @@ class OnlineEstimator:
             old, new = self.estimator.engine_for("retune"), fresh.engine_for("retune")
             new.fast[:], new.slow[:] = old.fast, old.slow
             new.theta[:] = old.theta
+            new.part("config", "hides")[:] = old.part("config", "hides")
             self.estimator = fresh
             self.guard.start(fresh)
 
@@ -579,6 +587,7 @@ class OnlineEstimator:
             return
         noise = self.watch.noise[list(SAMPLED)]
         floor = self.rows.floor(self.theta.tolist(), noise)
+        self.estimator.set_entry_noise(self._entry_noise())
         self._set(floor=floor, sigma=self.estimator.deviation)
         self._set(ratio=np.sqrt(self._now.square) / self.least)
 
@@ -598,7 +607,9 @@ class OnlineEstimator:
             else worst(missing, detector, self.watch)
         )
         if not found and self.estimator is not None and self.is_fitted:
-            found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
+            # residuals over their noise are no chance: what they make of a value is not in its sigma
+            unsure = self.sigma * max(1.0, float(self.ratio.max()))
+            found = implausible(self.names, self.theta, unsure, self.joint.fitted)
         found = found or alarm or (HELD if self.guard.on_probation else NONE)
         if found != self.fault and found:
             self._tell(f"fault {found}")
@@ -701,7 +712,15 @@ class OnlineEstimator:
         """Begin a search for the shapes on the rows kept."""
         window = two.window()
         weight = self._weight_of(window.shares, self.theta, self._size()) * window.on
-        two.launch(weight, self.theta, self.level, self.least, self._factory(), first=first)
+        two.launch(
+            weight,
+            self.theta,
+            level=self.level,
+            least=self.least,
+            noise=self._entry_noise(),
+            recursion=self._factory(),
+            first=first,
+        )
         self._tell(str(two.mode))
 
     def _advance(self, two: Reoptimiser) -> None:

@@ -125,6 +125,40 @@ def least_squares(y: FloatArray, h: FloatArray, least: FloatArray, like: IntArra
     return theta
 
 
+def told_beside_noise(
+    y: FloatArray, h: FloatArray, theta: FloatArray, noise: FloatArray, period: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A window without the entries of H that stand in their own noise.
+
+    At steady speed an acceleration is noise of the encoder, and seven seconds of it took an inertia
+    to a twentieth with a small error. Such an entry says nothing of its parameter: its part is
+    taken off y with the value from before, as the recursion does
+    (:meth:`identification.recursive.estimator.RecursiveLeastSquares.set_entry_noise`).
+
+    Parameters
+    ----------
+    y, h
+        As in :func:`least_range`, row after row.
+    theta : (parameters,) array
+        Values from before the window.
+    noise : (balances, parameters) array
+        Variance of the noise of the entries.
+    period : float
+        Time between two rows [s].
+
+    Returns
+    -------
+    y and h of what counts, and the mean squares at the end, (balances, parameters)
+    """
+    hides, rate = Settings.shown_over * noise, min(1.0, period / Settings.shown_seconds)
+    told, square = np.empty(h.shape, dtype=np.bool_), h[0] ** 2
+    for k, row in enumerate(h):
+        square = square + rate * (row**2 - square)
+        told[k] = square >= hides
+    left: FloatArray = y - np.where(told, 0.0, h) @ theta
+    return left, np.where(told, h, 0.0), square
+
+
 def first_estimate(
     y: FloatArray,
     h: FloatArray,

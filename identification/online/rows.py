@@ -100,6 +100,8 @@ class RowMaker:
         Kernel of the average, and of its rate [1/s].
     uses : (balances, sources) bool array
         Which sampled signals enter which balance.
+    entry_gain : (balances, parameters, sources) array
+        Variance of an entry of H over that of a signal's noise.
     """
 
     def __init__(
@@ -284,6 +286,7 @@ class RowMaker:
             for order, name in enumerate(POSITION_CHAINS[source])
         ]
         columns = np.array(self.place).T
+        self._own_gain()
         self._index, self._flat = columns[0], columns[1] * len(SOURCES) + columns[2]
         points = np.arange(new)[:, None]
         self._to = (points * len(_NAMES) + columns[0]).ravel()
@@ -417,6 +420,7 @@ class RowMaker:
         """Take other values for the shapes."""
         self.shape_values[:] = values
         self.linear = np.array(self.linear_of(self.shape_values))
+        self._own_gain()
         self.model = self.model.with_values(
             dict(zip(self.shapes, self.shape_values.tolist(), strict=True))
         )
@@ -454,6 +458,30 @@ class RowMaker:
         return self._share.copy()
 
     # --- noise ------------------------------------------------------------------------------------
+
+    def _own_gain(self) -> None:
+        """How the noise of each sampled signal gets into the entries of a row: of those that follow
+        from the signals without a law, as accelerations do; a law sees smoothed signals.
+        """
+        table = self.linear.reshape(len(self.balances), self.width, len(_NAMES))[:, 1:]
+        self.entry_gain = np.zeros((*table.shape[:2], len(SOURCES)))
+        for k, source in enumerate(SOURCES):
+            combined = sum(
+                table[:, :, _NAMES.index(name), None] * self.averaging[order]
+                for order, name in enumerate(POSITION_CHAINS[source])
+            )
+            self.entry_gain[:, :, k] = np.sum(combined**2, axis=2)
+
+    def entry_noise(self, noise: FloatArray) -> FloatArray:
+        """Variance that sensor noise gives each entry of H, (balances, parameters).
+
+        Parameters
+        ----------
+        noise : (sources,) array
+            Standard deviation of each sampled signal.
+        """
+        found: FloatArray = self.entry_gain @ noise**2
+        return found
 
     def floor(self, theta: Sequence[float], noise: FloatArray) -> FloatArray:
         """RMS that sensor noise alone leaves in each balance, as

@@ -31,7 +31,7 @@ many.
 _TUNING: Final = TwoStepSettings(max_evaluations=400)
 _PLAIN: Final = ("_rows", "_quiet_until", "_failures", "searches", "_asked", "_since", "_refine_at")
 _ARRAYS: Final = ("_signals", "_shares", "_on", "_points", "eta", "deviation")
-_TASK: Final = ("weight", "eta", "theta", "level", "least")
+_TASK: Final = ("weight", "eta", "theta", "level", "least", "noise")
 
 
 @final
@@ -174,10 +174,11 @@ class Reoptimiser:
         self,
         weight: FloatArray,
         theta: FloatArray,
+        *,
         level: FloatArray,
         least: FloatArray,
+        noise: FloatArray,
         recursion: Recursion,
-        *,
         first: bool = False,
     ) -> None:
         """Begin a search on the rows kept; `weight` as in :class:`Task`, for the rows of
@@ -190,6 +191,7 @@ class Reoptimiser:
             theta=theta.copy(),
             level=level.copy(),
             least=least.copy(),
+            noise=noise,
             first=first,
             forced=self._asked,
             local=self._failures >= self.settings.passes,
@@ -284,7 +286,7 @@ class Reoptimiser:
         window = RowWindow(
             arrays["job_signals"], arrays["job_shares"], arrays["job_on"] > 0, arrays["job_points"]
         )
-        weight, eta, theta, level, least = (arrays[f"job_{n}"] for n in _TASK)
+        weight, eta, theta, level, least, noise = (arrays[f"job_{n}"] for n in _TASK)
         self.job = Task(
             window,
             weight,
@@ -292,6 +294,7 @@ class Reoptimiser:
             theta=theta,
             level=level,
             least=least,
+            noise=noise,
             first=bool(first),
             forced=bool(forced),
             local=bool(local),

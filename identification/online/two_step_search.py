@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.errors import InputError
-from identification.online.first_window import least_squares, prior_range
+from identification.online.first_window import least_squares, prior_range, told_beside_noise
 from identification.online.two_step_rows import SIGNALS, RowWindow, ShapedBalances
 from identification.recursive.estimator import RecursiveLeastSquares
 from identification.two_step.algorithm import (
@@ -53,6 +53,8 @@ class Task:
         Shapes and linear parameters now.
     level, least : (balances,) array
         Size of the residuals before, and what counts as noise at least [N.m].
+    noise : (balances, parameters) array
+        Variance of the noise in the entries of the rows.
     first, forced, local : bool
         First search; asked for by the host; only a local simplex, after several searches that did
         not help.
@@ -64,6 +66,7 @@ class Task:
     theta: FloatArray
     level: FloatArray
     least: FloatArray
+    noise: FloatArray
     first: bool
     forced: bool
     local: bool
@@ -151,7 +154,9 @@ def search(
         return nothing(task, f"{text}; the shapes stay", good=good)
     eta = np.array([fit.nonlinear[n] for n in balances.shapes])
     tick()
-    level, estimator, scale = _restarted(task, balances, eta, recursion, tick)
+    level, estimator, scale = _restarted(
+        task, balances, eta, recursion, tick=tick, period=settings.sample_time
+    )
     return Found(
         eta,
         np.array([fit.deviation[n] for n in balances.shapes]),
@@ -246,7 +251,9 @@ def _restarted(
     balances: ShapedBalances,
     eta: FloatArray,
     recursion: Recursion,
+    *,
     tick: Callable[[], None],
+    period: float,
 ) -> tuple[FloatArray, RecursiveLeastSquares | None, FloatArray]:
     """Residuals of the window with the shapes found, a recursion that starts from its rows, and
     its scale.
@@ -257,12 +264,14 @@ def _restarted(
     if int(whole.sum()) < _FEWEST:
         return np.zeros(y.shape[1]), None, np.ones(len(task.theta))
     weight = task.weight[whole]
-    y, h = y[whole] * weight, h[whole] * weight[:, :, None]
+    y, h, entries = told_beside_noise(y[whole], h[whole], task.theta, task.noise, period)
+    y, h = y * weight, h * weight[:, :, None]
     first = least_squares(y, h, task.least, balances.like)
     tick()
     scale = prior_range(first, task.theta, h, y, balances.usual, balances.like)
     made = recursion(task.theta, scale)
     made.begin(y, h, task.least, overlap=balances.overlap)
+    made.set_entry_noise(task.noise, entries)
     return np.sqrt(np.mean((y - h @ made.theta) ** 2, axis=0)), made, scale
 
 

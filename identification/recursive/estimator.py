@@ -300,6 +300,36 @@ class RecursiveLeastSquares:
         )
         engine.part("config", "noise_known")[:] = 1.0
 
+    def set_entry_noise(
+        self, variance: npt.ArrayLike, square: npt.ArrayLike | None = None
+    ) -> None:
+        """New variances of the noise that entries of H themselves have, shape (outputs,
+        parameters), user units squared; zero, as at the start, where an entry is exact.
+
+        What stands in its noise says nothing of its parameter, and would take it down towards zero.
+        Such an entry counts as it is in the residual, and moves nothing
+        (`Settings.shown_over`).
+
+        Parameters
+        ----------
+        variance
+            See above.
+        square
+            Mean square of the entries up to now, same shape; None: goes on as it stands.
+        """
+        engine = self.engine_for("set_entry_noise")
+        shape = (engine.y.size, self._theta0.size)
+        given = np.asarray(variance, dtype=np.float64)
+        if given.shape != shape or not np.isfinite(given).all() or (given < 0).any():
+            raise InputError(
+                f"set_entry_noise: the variances must be {shape[0]} x {shape[1]} finite numbers "
+                ">= 0, one for each entry of H"
+            )
+        scaled = engine.part("config", "scale") ** 2
+        engine.part("config", "hides")[:] = (self._settings.shown_over * given * scaled).ravel()
+        if square is not None:
+            engine.part("fast", "size")[:] = (np.asarray(square) * scaled).ravel()
+
     # State
 
     def state(self) -> bytes:

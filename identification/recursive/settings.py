@@ -90,6 +90,12 @@ class Settings:
         Standard deviations beyond which a single innovation moves the estimate no further (Huber);
         2.5 touches 1 of 80 normal ones. Where the neighbours are as far off it counts in full. 0:
         every innovation counts in full.
+    shown_over
+        An entry of H counts where its mean square is over so many times the variance of its own
+        noise (`RecursiveLeastSquares.set_entry_noise`): noise in an entry takes the estimate down
+        by its share, here by 3 % of what such a row says at most.
+    shown_seconds
+        Time constant of that mean square, s: some rows, and no longer than a joint speeds up.
     """
 
     sample_time: float = 1e-3
@@ -117,6 +123,8 @@ class Settings:
     noise_seconds: float = 5.0
     inflation: float | None = None
     huber: float = 2.5
+    shown_over: float = 30.0
+    shown_seconds: float = 0.25
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
@@ -140,6 +148,7 @@ class Settings:
             "window_seconds",
             "rank_seconds",
             "noise_seconds",
+            "shown_seconds",
         ):
             if getattr(self, name) <= 0:
                 raise InputError(
@@ -261,6 +270,7 @@ class Layout:
                 ("info", triangle),
                 ("energy", m * n),
                 ("mean", m * n),
+                ("size", m * n),
             ]
         )
         self.slow = Block(
@@ -323,6 +333,8 @@ class Layout:
                 ("decay", 1),
                 ("inflation", 1),
                 ("huber", 1),
+                ("hides", m * n),
+                ("shown_rate", 1),
             ]
         )
 
@@ -382,6 +394,7 @@ def fill_config(
     config[at["clear_info"]] = settings.clear_amplitude**2
     config[at["inflation"]] = settings.inflation or 0.0
     config[at["huber"]] = settings.huber or 1e30
+    config[at["shown_rate"]] = min(1.0, step / settings.shown_seconds)
     config[at["decay"]] = math.exp(-config[at["check_length"]][0] / (1000.0 * block))
     return config
 

@@ -65,6 +65,13 @@ class _Sample:
         # 0 or 1 from here on: products are cheaper than branches.
         self.seen = [self.valid * enabled[o] for o in range(m)]
         self.used = [self.seen[o] * flags[n + o] for o in range(m)]
+        rate = config["shown_rate"][0]
+        self.size = [
+            old + self.seen[k // n] * rate * (self.h[k // n][k % n] ** 2 - old)
+            for k, old in enumerate(fast["size"])
+        ]
+        # what stands in its own noise says nothing of its parameter
+        self.shown = [now >= noise for now, noise in zip(self.size, config["hides"], strict=True)]
         self.free = config["free"]
         self.moving = [self.free[i] * flags[i] for i in range(n)]
         self.inflation = flags[n + m :]
@@ -137,7 +144,10 @@ def _correct(
         used = sample.used[o]
         # What a row says of a parameter is taken whether or not the rows before have shown it: left
         # out, it would be an error of the row that no covariance knows of.
-        h = [used * sample.free[i] * sample.h[o][i] for i in range(layout.n)]
+        h = [
+            used * sample.free[i] * sample.shown[o * layout.n + i] * sample.h[o][i]
+            for i in range(layout.n)
+        ]
         # The scalars see the estimate that the outputs before them have corrected.
         error = used * (sample.y[o] - dot(sample.h[o], theta)) if o else used * sample.error[o]
         square = sample.y[o] ** 2
@@ -184,6 +194,7 @@ def _correct(
         over.append(used * (average > limit))
         powers.append(power)
     new.values["learned"] = [fast["learned"][0] + sample.acts * calm]
+    new.values["size"] = sample.size
     new.values.update(
         theta=theta,
         noise=noises,

@@ -127,6 +127,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
 static void floors(Twin *m) {
     if (!m->s.rls.running) return;
     noise_floor(m, m->s.theta, m->s.floor);
+    tell_noise(&m->s);
     deviations(&m->s);
     ratios(&m->s);
 }
@@ -233,9 +234,11 @@ static int plant_verdict(const Fault *f) {
 }
 
 static int implausible(const State *s) { /* an inertia far from that of the fitted joint: a wrong scale of torque or current */
+    double over = 1; /* residuals over their noise are no chance: what they make of a value is not in its sigma */
     int i;
+    for (i = 0; i < N_BALANCES; i++) over = fmax(over, s->ratio[i]);
     for (i = 0; i < N_INERTIAS; i++) {
-        const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]];
+        const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]] * over;
         if (!(before / WRONG_SCALE < now && now < WRONG_SCALE * before) && fabs(now - before) > WRONG_SIGMAS * spread) return inertia_code[i];
     }
     return 0;

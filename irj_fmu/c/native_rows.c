@@ -103,10 +103,23 @@ static void standstill(Twin *m, double share[2]) {
     still(m->arg, m->res, m->iw, m->w, 0);
 }
 
+static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE}; /* behind the sampled signals */
+
+/* Variance that sensor noise gives each entry of h. */
+static void entry_noise(const State *s, double out[N_BALANCES * N_THETA]) {
+    int k, source;
+    for (k = 0; k < N_BALANCES * N_THETA; k++) {
+        out[k] = 0;
+        for (source = 0; source < SOURCES; source++) {
+            const double noise = s->watch.noise[reading[source]];
+            out[k] += entry_gain[k * SOURCES + source] * (noise * noise);
+        }
+    }
+}
+
 /* RMS that sensor noise alone leaves in each balance. */
 static void noise_floor(Twin *m, const double theta[N_THETA], double out[N_BALANCES]) {
     State *s = &m->s;
-    static const int reading[SOURCES] = {Q_M, Q_L, TAU, DRIVE};
     double entering[N_BALANCES][N_SIGNALS] = {{0}}, values[N_VALUES], slope[3 * N_BALANCES];
     int i, j, b, source;
     for (i = 0; i < N_LINEAR; i++) {

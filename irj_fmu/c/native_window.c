@@ -7,6 +7,35 @@ static void weight_of(Twin *m, const double shares[2], const double theta[N_THET
     row_weight(m->arg, m->res, m->iw, m->w, 0);
 }
 
+/* Mean square under which an entry of h does not count: RecursiveLeastSquares.set_entry_noise. */
+static void tell_noise(State *s) {
+    int k;
+    entry_noise(s, s->rls.config + CONFIG_HIDES);
+    for (k = 0; k < N_BALANCES * N_THETA; k++) s->rls.config[CONFIG_HIDES + k] *= SHOWN_OVER * (s->scale[k % N_THETA] * s->scale[k % N_THETA]);
+}
+
+/* The window without the entries of h that stand in their own noise, and the mean squares at its end: told_beside_noise. */
+static void told_beside_noise(Twin *m, double square[N_BALANCES * N_THETA]) {
+    State *s = &m->s;
+    FirstWindow *f = &s->window;
+    double noise[N_BALANCES * N_THETA];
+    int k, b, i;
+    entry_noise(s, noise);
+    for (k = 0; k < f->count; k++)
+        for (b = 0; b < N_BALANCES; b++) {
+            double off = 0;
+            for (i = 0; i < N_THETA; i++) {
+                const int at = b * N_THETA + i;
+                const double own = f->h[k][b][i] * f->h[k][b][i];
+                square[at] = k ? square[at] + SHOWN_RATE * (own - square[at]) : own;
+                if (square[at] >= SHOWN_OVER * noise[at]) continue;
+                off += f->h[k][b][i] * s->theta[i];
+                f->h[k][b][i] = 0;
+            }
+            f->y[k][b] -= off;
+        }
+}
+
 static double error_of(const double y, const double h[N_THETA], const double theta[N_THETA]) {
     double sum = 0;
     int i;
@@ -233,7 +262,9 @@ static void deviations(State *s) {
 static int begin_recursion(Twin *m) {
     State *s = &m->s;
     double first[N_THETA], range[N_THETA], known[N_THETA], least[N_BALANCES], floor[N_BALANCES];
-    int i, b, undetermined;
+    double square[N_BALANCES * N_THETA];
+    int i, b, k, undetermined;
+    told_beside_noise(m, square);
     for (b = 0; b < N_BALANCES; b++) {
         s->torque[b] /= s->window.count;
         least[b] = fmax(s->floor_share * sqrt(s->torque[b]), LEAST);
@@ -247,6 +278,8 @@ static int begin_recursion(Twin *m) {
     for (i = 0; i < N_THETA; i++) s->scale[i] = usual_range[i] > 0 ? usual_range[i] : fmax(known[i], range[i]);
     clear_recursion(s);
     undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
+    for (k = 0; k < N_BALANCES * N_THETA; k++) s->rls.fast[FAST_SIZE + k] = square[k] * (s->scale[k % N_THETA] * s->scale[k % N_THETA]);
+    tell_noise(s);
     estimate_of(s, &s->rls, first);
     show(s, first);
     deviations(s);

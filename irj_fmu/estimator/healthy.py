@@ -56,6 +56,19 @@ def read_healthy(
     return found
 
 
+def may_watch(record: Record, state: bytes | None) -> bool:
+    """Whether the estimator's detector may judge the sensors of a record: a velocity that is
+    derived has noise of its own, which limits that are guessed call a failure.
+
+    Parameters
+    ----------
+    record : Record
+    state : bytes or None
+        Of a detector with limits from healthy records.
+    """
+    return state is not None or record.has("motor_velocity", "link_velocity")
+
+
 def detector_state(
     joint: Joint,
     options: OnlineOptions,

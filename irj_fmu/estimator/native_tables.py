@@ -287,6 +287,7 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.whole("linear_row", (i for i, _ in linear))
     header.whole("linear_column", (j for _, j in linear))
     header.doubles("linear_value", [rows.linear[i, j] for i, j in linear])
+    header.doubles("entry_gain", rows.entry_gain.ravel())
     uses = ",\n ".join("{" + ", ".join(str(int(v)) for v in line) + "}" for line in rows.uses)
     header.raw(f"static const unsigned char uses[N_BALANCES][SOURCES] = {{{uses}}};")
     names = rows.model.parameter_names
@@ -334,7 +335,7 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
 
 
 def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
-    from identification.recursive.settings import start_state
+    from identification.recursive.settings import Settings, start_state
 
     period = made.rows.timing.stride * made.dt
     engine = made.recursion(made.theta).engine_for("generate")
@@ -349,10 +350,14 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("OVERLAP", float(made.rows.timing.overlap))
     for name in ("RANGE", "PASSES", "DEVIATION"):
         header.define(f"FIRST_{name}", getattr(first_window, name))
+    header.define("SHOWN_OVER", float(Settings.shown_over))
+    header.define("SHOWN_RATE", min(1.0, period / Settings.shown_seconds))
+    told = ("d", "u", "theta", "noise", "error", "learned", "alarm", "due", "size")
+    tuned = ("scale", "theta0", "walk", "walk_alarm", "enabled", "start", "hides")
     for name, block, parts in (
-        ("FAST", layout.fast, ("d", "u", "theta", "noise", "error", "learned", "alarm", "due")),
+        ("FAST", layout.fast, told),
         ("SLOW", layout.slow, ()),
-        ("CONFIG", layout.config, ("scale", "theta0", "walk", "walk_alarm", "enabled", "start")),
+        ("CONFIG", layout.config, tuned),
     ):
         header.define(f"N_{name}", block.size)
         for part in parts:

@@ -68,6 +68,39 @@ def test_the_sensor_is_named(
     assert "smallest offset of a sensor" in capsys.readouterr().out
 
 
+def test_without_healthy_records_no_derived_velocity_is_judged(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = folder / "plain.json"
+    given = ["track", str(folder / "unseen.npz"), "--joint", str(folder / "joint.toml")]
+    assert main([*given, "--json", str(out)]) == 0
+    result = json.loads(out.read_text())["records"][0]
+    assert result["events"] == []
+    assert not result["detector"]
+    assert "--healthy" in result["not_watched"]
+    assert result["not_watched"] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("tried", "said"),
+    [
+        ("link_position:odd:9", "unknown kind 'odd'"),
+        ("link_velocity:bias:9:0.1", "no reading of its own for link_velocity"),
+    ],
+)
+def test_a_fault_of_nothing_is_refused_before_limits_are_worked_out(
+    folder: Path,
+    tried: str,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("irj_fmu.estimator.bank.bank_for", None)  # would be a crash: exit 3
+    given = ["track", str(folder / "unseen.npz"), "--joint", str(folder / "joint.toml")]
+    assert main([*given, "--healthy", str(folder / "healthy.npz"), "--inject", tried]) == 2
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("verdict", "about", "said"),
     [

@@ -471,7 +471,9 @@ def parser() -> OneLineParser:
         metavar="SENSOR:KIND:START[:SIZE[:END]]",
         action="append",
         default=[],
-        help="put a fault into the readings to see what is found, as link_position:stuck:9",
+        help="put a fault into the readings to see what is found, as link_position:stuck:9 or "
+        "current:bias:9:20; SIZE is referred to the link: N.m, rad and rad/s, of a linear axis N, "
+        "m and m/s (gain: share; delay: s; drift: per s)",
     )
     planned = verb(
         "plan", "online", "select a motion that makes the parameters identifiable", joint=True

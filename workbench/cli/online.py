@@ -17,7 +17,7 @@ import numpy.typing as npt
 from identification.data.formats import words
 from identification.errors import InputError
 from irj_fmu.command_line import counted
-from irj_fmu.estimator.healthy import online_readings
+from irj_fmu.estimator.healthy import may_watch, online_readings
 from workbench.cli.files import (
     named,
     needed,
@@ -57,6 +57,11 @@ def run_track(arguments: Namespace) -> int:
         raise InputError(f"{stream}: a stream has no end; add --follow to track it as it comes")
     tried = [parse_fault(text) for text in getattr(arguments, "inject", None) or []]
     records, raw, warnings = _open_doubtful(arguments.records, joint)
+    for path, record in zip(arguments.records, records, strict=True):
+        try:
+            online_readings(record, joint, tried)  # no limit is worked out for a fault of nothing
+        except InputError as error:
+            raise named(error, path, record) from None
     healthy, more = open_records(arguments.healthy, joint)
     healthy = [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)]
     banks = _banks(joint, raw, healthy)
@@ -163,7 +168,7 @@ def _announced(
     longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
     rows = np.array(online_readings(healthy, joint)[0])[longest]
     found = bank.smallest(Piece(healthy.time[longest], rows))
-    print(f"{path}: smallest offset of a sensor that is seen, and that is named")
+    print(f"{path}: smallest offset of a sensor that is seen, and that is named (referred to the link)")
     for name, (seen, told) in found.items():
         at = SENSORS.index(name)
         unit = "rad" if at in (1, 3) else "rad/s" if at in (2, 4) else "N.m"
@@ -216,7 +221,7 @@ def _open_doubtful(
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault to try, as ``SENSOR:KIND:START[:SIZE[:END]]``; size in the unit of the reading, times
+    """A fault to try, as ``SENSOR:KIND:START[:SIZE[:END]]``; size referred to the link, SI, times
     in s.
 
     Raises
@@ -236,6 +241,8 @@ def parse_fault(text: str) -> Fault:
         start, size, end = (*map(float, numbers), *(0.0, math.inf)[max(len(numbers) - 1, 0) :])
     except ValueError:
         raise InputError(f"--inject {text!r}: {how}") from None
+    if kind not in KINDS:
+        raise InputError(f"--inject {text!r}: unknown kind {kind!r}; {how}")
     if len(numbers) < 2 and kind not in ("stuck", "zero", "dropout"):
         raise InputError(f"--inject {text!r}: {kind} needs a size; {how}")
     try:
@@ -342,7 +349,7 @@ def replay(
     options = OnlineOptions(
         has_link=record.has("link_position"),
         has_torque=record.has("link_torque"),
-        detect=watch is None,
+        detect=watch is None and may_watch(record, detector_state),
     )
     estimator = OnlineEstimator(joint, even.dt, options, detector_state)
     table, there = online_readings(even, joint)
@@ -446,10 +453,7 @@ def _print_track(result: dict[str, Any]) -> None:
             + ", ".join(f"{b} {r:.3g}" for b, r in result["ratio"].items())
         )
     if not result["detector"]:
-        print(
-            "  sensor faults were not looked for: that needs an elastic joint file with fitted "
-            "values (`irj fit -o`)"
-        )
+        print(f"  {result['not_watched']}")
     for event in result["events"]:
         print(f"  {event['time']:.3f} s: {event['text']}")
     for span in result["replaced"]:

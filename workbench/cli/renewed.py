@@ -66,6 +66,9 @@ def _identified(
 
     event: dict[str, Any] = {"time": stop, "first": start, "fault": 0, "changed": None}
     span = f"from {start:.3f} s on"
+    if not rows.any():
+        text = f"not identified again {span}: a sensor counts as failed in every sample"
+        return {**event, "text": text}
     try:
         found = changed(joint, record.take(rows, f"{span}, after the joint changed"))
     except InputError as error:

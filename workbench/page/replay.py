@@ -206,6 +206,7 @@ def _kept(folder: Path, made: Replay, steps: Sequence[StepEntry], more: Mapping[
             "unit": "s",
             "readings": [r for r, there in zip(READINGS, estimator.present, strict=True) if there],
             **more,
+            "no_detector": made.not_watched or more.get("no_detector", ""),
         }
     )
     path = folder / FILE

@@ -25,6 +25,16 @@ UNESTIMATED: Final = (
     "which every reading is good"
 )
 
+UNFITTED: Final = (
+    "sensor faults were not looked for: that needs an elastic joint file with fitted values "
+    "(`irj fit -o`)"
+)
+UNMEASURED: Final = (
+    "sensor faults were not looked for: the velocities are derived, and their noise looks like a "
+    "failure until records of the healthy joint are given with --healthy, each run a file of its "
+    "own"
+)
+
 READINGS: Final = (
     "motor current",
     "motor position",
@@ -140,6 +150,15 @@ class Replay:
         """Whether sensor faults were looked for."""
         return self.banked or self.estimator.detector is not None
 
+    @property
+    def not_watched(self) -> str:
+        """Why sensor faults were not looked for; nothing where they were."""
+        if self.watched:
+            return ""
+        estimator = self.estimator
+        fitted = estimator.is_fitted and estimator.model.is_elastic
+        return UNMEASURED if fitted and not estimator.options.detect else UNFITTED
+
     def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
         """Times [s] from which to which a reading is replaced; any reading where none is named."""
         failed = self.failed.any(axis=1) if reading is None else self.failed[:, reading]
@@ -158,6 +177,7 @@ class Replay:
             "record": self.record.name,
             "time": self.time.tolist(),
             "detector": self.watched,
+            "not_watched": self.not_watched,
             "calibrated": self.calibrated,
             "smallest": {
                 name: {"seen": a, "named": b if np.isfinite(b) else None}

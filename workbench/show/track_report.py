@@ -69,12 +69,9 @@ def _verdict(replays: Sequence[Replay], notes: Sequence[str]) -> str:
         for r in replays
         if len(r.events) > 12
     ]
-    hints = []
-    if not all(r.watched for r in replays):
-        hints.append(
-            "Sensor faults need an elastic joint file with fitted values (<code>irj fit -o</code>)."
-        )
-    elif not all(r.calibrated for r in replays):
+    blind = dict.fromkeys(r.not_watched for r in replays if not r.watched)
+    hints = [f"{text(why[:1].upper() + why[1:])}." for why in blind]
+    if not blind and not all(r.calibrated for r in replays):
         hints.append(
             "The limits of the fault detector are guesses: give records of the healthy joint "
             "with <code>--healthy</code>."

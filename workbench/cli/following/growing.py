@@ -19,7 +19,7 @@ from identification.data.read import read
 from identification.data.read.csv import head_of, wide_encoding
 from identification.data.record import Record
 from identification.errors import InputError
-from irj_fmu.estimator.healthy import online_readings
+from irj_fmu.estimator.healthy import may_watch, online_readings
 from workbench.cli.files import needed
 from workbench.cli.following.stepper import Stepper, arrays_of
 from workbench.show.replayed import READINGS, Replay
@@ -205,7 +205,9 @@ class _Run:
             if not first.has(channel):
                 raise InputError(f"{first.name}: has no {channel}, which the estimator reads")
         options = OnlineOptions(
-            has_link=first.has("link_position"), has_torque=first.has("link_torque")
+            has_link=first.has("link_position"),
+            has_torque=first.has("link_torque"),
+            detect=may_watch(first, state),
         )
         self.joint, self.name, self.kind = joint, first.name, first.kind
         self.calibrated = bool(state)
