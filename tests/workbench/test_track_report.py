@@ -268,6 +268,20 @@ def test_timeline_draws_the_failure_where_it_was(failed: Replay) -> None:
     assert len({b[1] for b in bars}) == 2, "each reading has a lane of its own"
 
 
+def test_a_model_that_explained_little_before_puts_a_verdict_in_doubt(
+    failed: Replay, joint: Joint
+) -> None:
+    assert failed.doubt == ""
+    begun = failed.time < failed.events[0]["time"]
+    ratios = np.where(begun[:, None], [[8.0, 1.0, 1.0]], failed.ratios)
+    lacking = dataclasses.replace(failed, ratios=ratios)
+    assert "motor at 8 times the noise" in lacking.doubt
+    assert lacking.as_json()["doubt"][1:] in track_page([lacking], joint, command="")
+    # what stands over the noise from the failure on is the failure
+    assert dataclasses.replace(failed, ratios=np.where(begun[:, None], 1.0, 9.0)).doubt == ""
+    assert dataclasses.replace(lacking, events=()).doubt == ""
+
+
 def test_curves_of_a_reading_part_at_the_failure(failed: Replay) -> None:
     """The reading stays where it was stuck; the reconstruction goes on."""
     drawn = signal_picture(failed, 3, (8.0, 8.9), 860)

@@ -168,7 +168,10 @@ def _announced(
     longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
     rows = np.array(online_readings(healthy, joint)[0])[longest]
     found = bank.smallest(Piece(healthy.time[longest], rows))
-    print(f"{path}: smallest offset of a sensor that is seen, and that is named (referred to the link)")
+    print(
+        f"{path}: smallest offset of a sensor that is seen, and that is named (referred to the "
+        "link)"
+    )
     for name, (seen, told) in found.items():
         at = SENSORS.index(name)
         unit = "rad" if at in (1, 3) else "rad/s" if at in (2, 4) else "N.m"
@@ -246,7 +249,7 @@ def parse_fault(text: str) -> Fault:
     if len(numbers) < 2 and kind not in ("stuck", "zero", "dropout"):
         raise InputError(f"--inject {text!r}: {kind} needs a size; {how}")
     try:
-        return Fault(sensor, kind, start, size, end)  # type: ignore[arg-type]
+        return Fault(sensor, kind, start, size, end)
     except InputError as error:
         raise InputError(f"--inject {text!r}: {error}") from None
 
@@ -456,6 +459,8 @@ def _print_track(result: dict[str, Any]) -> None:
         print(f"  {result['not_watched']}")
     for event in result["events"]:
         print(f"  {event['time']:.3f} s: {event['text']}")
+    if result.get("doubt"):
+        print(f"  {result['doubt']}")
     for span in result["replaced"]:
         print(f"  {span['reading']} replaced from {span['from']:.3f} s to {span['to']:.3f} s")
     if result["detector"] and not result["calibrated"]:

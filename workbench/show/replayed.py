@@ -13,6 +13,7 @@ from identification.data.formats import words
 from identification.data.record import Record
 from identification.faults.detector import Fault, FaultEvent
 from identification.faults.types import Verdict
+from identification.fitting.assess import RATIO_LIMIT
 from identification.online.estimator import OnlineEstimator
 
 FloatArray = npt.NDArray[np.float64]
@@ -159,6 +160,27 @@ class Replay:
         fitted = estimator.is_fitted and estimator.model.is_elastic
         return UNMEASURED if fitted and not estimator.options.detect else UNFITTED
 
+    @property
+    def doubt(self) -> str:
+        """What speaks against the verdicts: a model that did not explain the readings before the
+        first of them; nothing where it did, or where nothing was said.
+        """
+        if not self.events:
+            return ""
+        before = self.ratios[self.time < float(self.events[0]["time"])]
+        stood = np.median(before, axis=0) if len(before) else np.zeros(0)
+        over = [
+            f"{balance} at {ratio:.3g}"
+            for balance, ratio in zip(self.estimator.balances, stood.tolist(), strict=False)
+            if ratio > RATIO_LIMIT
+        ]
+        if not over:
+            return ""
+        return (
+            f"the model did not explain the readings before ({', '.join(over)} times the noise), "
+            "so that a verdict may be what it lacks: run irj improve first"
+        )
+
     def spans(self, reading: int | None = None) -> list[tuple[float, float]]:
         """Times [s] from which to which a reading is replaced; any reading where none is named."""
         failed = self.failed.any(axis=1) if reading is None else self.failed[:, reading]
@@ -178,6 +200,7 @@ class Replay:
             "time": self.time.tolist(),
             "detector": self.watched,
             "not_watched": self.not_watched,
+            "doubt": self.doubt,
             "calibrated": self.calibrated,
             "smallest": {
                 name: {"seen": a, "named": b if np.isfinite(b) else None}

@@ -76,6 +76,10 @@ def _verdict(replays: Sequence[Replay], notes: Sequence[str]) -> str:
             "The limits of the fault detector are guesses: give records of the healthy joint "
             "with <code>--healthy</code>."
         )
+    hints += [
+        f"{text(doubt[:1].upper() + doubt[1:])}."
+        for doubt in dict.fromkeys(r.doubt for r in replays if r.doubt)
+    ]
     if any(r.tried for r in replays):
         hints.append("The faults shown were put into healthy readings on purpose.")
     hints += [text(n) for n in notes]
