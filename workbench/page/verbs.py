@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
+from identification.balance.dataset import without
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.desk import tree
@@ -115,12 +116,13 @@ def wait_settled(live: Live, seconds: float = 30.0) -> None:
 
 
 def addable(live: Live) -> list[dict[str, Any]]:
-    """Effects of the library that can be added by hand, with title, place and whether they are
-    in the model.
+    """Effects of the library that can be added by hand, with title, place, whether they are in the
+    model, and whether another effect there needs them.
     """
     from casadi_models import EFFECTS
 
     inside = set(live.state.steps[-1].effects) if live.state.steps else set()
+    needed = _needed(live) if inside else set()
     joint = live.joint_or_none()
     linear = joint is not None and joint.kind == "linear"
     rows = []
@@ -139,9 +141,21 @@ def addable(live: Live) -> list[dict[str, Any]]:
                     "absence": e.absence,
                     "excitation": e.excitation,
                     "inside": label in inside,
+                    "needed": label in needed,
                 }
             )
     return rows
+
+
+def _needed(live: Live) -> set[str]:
+    """Effects of the model that cannot go, as another one in it builds on them."""
+    model, out = live.analysis().current.model, set()
+    for label in model.effects:
+        try:
+            without(model, label)
+        except (KeyError, ValueError):
+            out.add(label)
+    return out
 
 
 def current_effects(state: State) -> list[str]:
