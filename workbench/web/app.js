@@ -88,6 +88,7 @@ function gone(title, why, first) {
   main.replaceChildren(...heading(title, why),
     h("div", { class: "row" }, first, button("See the sessions", () => open("home"), { kind: first ? "" : "primary", work: false, id: "gone-home" }), button("Start a new session", () => act(fresh), { work: false, id: "gone-fresh" })));
   document.title = `${title} – Joint workbench`;
+  drawRails();
   main.focus({ preventScroll: true });
 }
 function clearError() { $("error").hidden = true; }
@@ -265,6 +266,7 @@ function render(moved) {
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
   app.drawn = null; /* until a picture is drawn for the width there is */
+  placeRails();
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
     if (token !== app.token) return;
@@ -272,9 +274,11 @@ function render(moved) {
       main.replaceChildren(...[nodes].flat(3).filter(Boolean));
       main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
       document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
+      drawRails();
       surround();
-      (app.after || []).forEach((f) => f());
+      const after = app.after || [];
       app.after = [];
+      after.forEach((f) => f());
     }, moved);
     scrollTo(0, where);
   }).catch(fail);
@@ -349,6 +353,7 @@ async function boot() {
   const dark = matchMedia("(prefers-color-scheme: dark)"), wished = () => remembered("irj-theme") || (dark.matches ? "dark" : "light");
   theme(wished());
   dark.addEventListener("change", () => { theme(wished()); render(false); });
+  WIDE.addEventListener("change", () => { if (app.view) render(false); });
   let turned = null;
   addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { showStep(); if (app.drawn && Math.abs(pictureRoom() / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });
