@@ -102,20 +102,29 @@ class ServedChart {
     if (this.from != null) this.shade([Math.min(this.from, v), Math.max(this.from, v)]);
     this.said.textContent = `${digits(v)} | ${digits(f.y[1] - ((up - f.top) / (f.bottom - f.top)) * (f.y[1] - f.y[0]))}`;
   }
-  /* The other plots stand at the same moment: in the time plot's window, the one whose value of this
-     signal is nearest. */
+  /* The other plots stand at the same moment: the one of the time plot's window whose value of this
+     signal is nearest; where none is near, the one of the whole record, which the strip shows. */
   point(v) {
-    if (!this.axis || !linked.plot || !linked.plot.data) return;
-    const { time, along } = linked.plot.data, seen = this.axis === "time" ? time : along[this.axis];
-    if (v == null || !seen) { linked.plot.pointAt(null); return; }
-    const [low, high] = linked.plot.range || [-Infinity, Infinity];
-    let best = -1;
-    for (let k = 0; k < seen.length; k++) {
-      if (seen[k] == null || time[k] < low || time[k] > high) continue;
-      if (best < 0 || Math.abs(seen[k] - v) < Math.abs(seen[best] - v)) best = k;
-    }
+    const { plot } = linked;
+    if (!this.axis || !plot || !plot.data) return;
+    plot.pointAt(null);
+    if (v == null) return;
+    const seenIn = (data) => (this.axis === "time" ? data.time : data.along[this.axis] || []);
+    const nearest = (data, [low, high]) => {
+      const seen = seenIn(data);
+      let best = -1;
+      for (let k = 0; k < seen.length; k++) {
+        if (seen[k] == null || data.time[k] < low || data.time[k] > high) continue;
+        if (best < 0 || Math.abs(seen[k] - v) < Math.abs(seen[best] - v)) best = k;
+      }
+      return best;
+    };
+    const [low, high] = this.spec.frame.x, here = nearest(plot.data, plot.range || plot.full);
+    const near = here >= 0 && Math.abs(seenIn(plot.data)[here] - v) < (high - low) / 50;
     linked.pointed = this;
-    linked.plot.pointAt(best < 0 ? null : best);
+    if (near) plot.pointAt(here);
+    else cursorInCharts(plot.whole)(nearest(plot.whole, plot.full));
+    if (!near) plot.stripAt(plot.whole.time[nearest(plot.whole, plot.full)]);
     linked.pointed = null;
   }
   shade(range) {
@@ -165,8 +174,10 @@ function outcomeOf(d) {
 }
 function outcomeCard(d, claim, folded) {
   const kind = outcomeOf(d), words = app.config.words.outcomes[kind] || { headline: d.headline, next: "" };
-  const next = words.next ? h("p", { class: "next" }, h("strong", {}, "Next: "), words.next) : null;
-  return h("section", { class: `card outcome ${kind}`, "aria-label": "Outcome" }, claim, folded ? h("details", {}, h("summary", {}, "Why, and what next"), folded, next) : next);
+  const said = words.next && h("p", { class: "next" }, h("strong", {}, "Next: "), words.next);
+  const next = said || null;
+  const rest = folded ? h("details", {}, h("summary", {}, "Why, and what next"), folded, next) : next;
+  return h("section", { class: `card outcome ${kind}`, "aria-label": "Outcome" }, claim, rest);
 }
 
 /* A term with its meaning, from the one glossary. */
@@ -236,7 +247,8 @@ function againstCard(files) {
   const pick = (key, label, options) => h("label", { class: "small pick" }, label, h("select", { id: `against-${key}`, "aria-describedby": key === "colour" ? "against-why" : null, onchange: (e) => { draft[key] = e.target.value; if (key === "file") render(false); else { now[key] = e.target.value; allow(); draw().catch(fail); } } }, options.map(([v, t]) => h("option", { value: v, selected: v === (key === "file" ? file.id : now[key]) }, t))));
   const box = h("details", { class: "card", id: "against", open: Boolean(draft.open), ontoggle: (e) => { draft.open = e.target.open; if (e.target.open && !host.childNodes.length) draw().catch(fail); } }, h("summary", {}, "Any signal against any"),
     h("div", { class: "row" }, pick("file", "Record", files.map((f) => [f.id, f.name])), pick("x", "Across", [["time_in_run", "time, runs over each other"], ...titles(channels)]), pick("y", "Up", titles(channels)), pick("colour", "Coloured by", [["", "nothing"], ...titles(channels)]), pick("other", "Over it", [["", "no other record"], ...files.filter((f) => f.id !== file.id).map((f) => [f.id, f.name])])),
-    h("p", { class: "small soft", id: "against-why" }, "Colour needs one record across a signal: over time, and with a second record, the colours tell the records apart."), host, legend);
+    h("p", { class: "small soft", id: "against-why" }, "Colour needs one record across a signal: over",
+      " time, and with a second record, the colours tell the records apart."), host, legend);
   allow();
   return box;
 }
@@ -249,11 +261,16 @@ function leftOut(file, plot) {
   const windows = file.left_out || [], put = (list) => act(async () => { await post(`/file/${file.id}`, { left_out: list }); await refresh(); });
   plot.marks = () => windows;
   const only = () => {
-    if (!plot.range) { fail(new Error("drag across the plot first: the window that is shown is fitted, all else left out")); return; }
+    if (!plot.range) {
+      fail(new Error("drag across the plot first: what is shown is fitted, all else left out"));
+      return;
+    }
     const [low, high] = plot.full, [a, b] = plot.range;
     put([...windows, [low, a], [b, high]].filter(([from, to]) => to > from));
   };
-  return h("div", { class: "row under", id: "left-out" }, button("Fit only this window", only, { kind: "quiet", id: "fit-only" }), button("Leave out this window", () => { if (plot.range) put([...windows, plot.range]); else fail(new Error("drag across the plot first: the window that is shown is left out")); }, { kind: "quiet", id: "leave-out" }),
+  return h("div", { class: "row under", id: "left-out" },
+    button("Fit only this window", only, { kind: "quiet", id: "fit-only" }),
+    button("Leave out this window", () => { if (plot.range) put([...windows, plot.range]); else fail(new Error("drag across the plot first: the window that is shown is left out")); }, { kind: "quiet", id: "leave-out" }),
     windows.map(([a, b], k) => button(`Take back ${digits(a, 4)} to ${digits(b, 4)} s`, () => put(windows.filter((_, n) => n !== k)), { kind: "quiet", id: `take-back-${k}` })));
 }
 

@@ -85,12 +85,16 @@ function storeDraft({ text, typed, added }) {
   try {
     if (nothing) sessionStorage.removeItem(draftKey());
     else sessionStorage.setItem(draftKey(), JSON.stringify({ text, typed, added }));
-  } catch (error) { /* a browser that keeps nothing, or a full store: it stays until the page goes */ }
+  } catch (error) { /* a browser that keeps nothing: it stays until the page goes */ }
 }
 
 /* Another tab, another page or a joint file changed the joint while it was edited here: nothing is saved over it, and nothing typed goes, until it is said which counts. */
 function movedJoint(draft, text) {
-  const taken = (drop) => { if (drop) { delete app.drafts.joint; storeDraft({ typed: {}, added: [] }); } else draft.text = text; clearError(); render(false); };
+  const taken = (drop) => {
+    if (drop) delete app.drafts.joint; else draft.text = text;
+    if (drop) storeDraft({ typed: {}, added: [] });
+    clearError(); render(false);
+  };
   return h("section", { class: "note", id: "joint-moved", role: "status" },
     h("p", {}, h("strong", {}, "The joint was changed elsewhere"), " since you began to edit it: in another tab, on another page or by a joint file. What you typed still stands below and is not saved."),
     h("details", {}, h("summary", {}, "The joint as it is now"), h("pre", { tabindex: "0", "aria-label": "The joint as it is now" }, text)),

@@ -7,10 +7,15 @@ const choice = (id, label, options, chosen, hint, onchange, size = "") => h("div
 
 /* A picture with Save under it, as under every plot. */
 function kept(name, picture, table) {
-  return [picture, h("div", { class: "row under end" }, saver(name, () => svgFile(picture), table))];
+  const save = saver(name, () => svgFile(picture), table);
+  return [picture, h("div", { class: "row under end" }, save)];
 }
-const csvCell = (v) => (v == null ? "" : /[",\n]/.test(String(v)) ? `"${String(v).replace(/"/g, '""')}"` : String(v));
-const csvOf = (head, rows) => [head, ...rows].map((r) => r.map(csvCell).join(",")).join("\n") + "\n";
+const csvCell = (v) => {
+  const text = v == null ? "" : String(v);
+  return /[",\n]/.test(text) ? `"${text.replace(/"/g, '""')}"` : text;
+};
+const csvLine = (row) => row.map(csvCell).join(",") + "\n";
+const csvOf = (head, rows) => [head, ...rows].map(csvLine).join("");
 function timelineCsv(r) {
   const score = (name, i) => (r.score[name] || [])[i];
   return csvOf(["time [s]", ...r.readings.map((n) => `${n}, share of the limit`), "replaced"],
@@ -98,16 +103,23 @@ function followed(name, p, time, end, stderr) {
   const least = 0.05 * Math.max(Math.abs(p.fitted ?? y1), 1e-12);
   if (y1 - y0 < least) { const c = (y0 + y1) / 2; y0 = c - least / 2; y1 = c + least / 2; }
   const X = (t) => L + (t / end) * (W - L - R), Y = (v) => T + ((y1 - v) / (y1 - y0)) * (H - T - B);
-  const none = p.fitted != null && Math.abs(p.fitted) <= 1.96 * Math.max(stderr || 0, p.sigma || 0); /* zero within its error: a share of it says nothing */
+  /* zero within its error: a share of it says nothing */
+  const error = 1.96 * Math.max(stderr || 0, p.sigma || 0);
+  const none = p.fitted != null && Math.abs(p.fitted) <= error;
   const change = p.fitted && !none ? (100 * (p.value - p.fitted)) / Math.abs(p.fitted) : null;
   const said = `${words(name)}: ${digits(p.value, 4)} ${unit(p.unit)}${change == null ? "" : `, ${digits(change, 2)} percent from the fit`}`;
   const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": said });
-  for (const t of ticks(y0, y1, 3)) out.append(svg("path", { class: "s-grid", d: `M${L} ${Y(t)}H${W - R}` }), svg("text", { x: L - 4, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
+  for (const t of ticks(y0, y1, 3)) {
+    out.append(svg("path", { class: "s-grid", d: `M${L} ${Y(t)}H${W - R}` }),
+      svg("text", { x: L - 4, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
+  }
   if (p.fitted != null) out.append(svg("path", { class: "s-ref", d: `M${L} ${Y(p.fitted)}H${W - R}` }));
   out.append(svg("path", { class: "s-thin", d: "M" + time.map((t, i) => [t, p.history[i]]).filter(([, v]) => v != null).map(([t, v]) => `${X(t)} ${Y(v)}`).join("L") }));
   out.append(svg("text", { x: L, y: H - 5 }, "0"), svg("text", { x: W - R, y: H - 5, "text-anchor": "end" }, seconds(end)));
   return h("figure", { class: "spark" }, h("figcaption", {}, words(name), h("span", {}, `${digits(p.value, 4)} ± ${digits(p.sigma, 2)} ${unit(p.unit)}${change == null ? "" : ` · ${change >= 0 ? "+" : ""}${digits(change, 2)} % from the fit`}${none ? " · zero within its error in the fit" : ""}`)),
-    kept(`${words(name)} as it was followed`, out, () => csvOf(["time [s]", `${words(name)} [${p.unit}]`, "of the fit"], time.map((t, i) => [t, p.history[i], p.fitted]))));
+    kept(`${words(name)} as it was followed`, out,
+      () => csvOf(["time [s]", `${words(name)} [${p.unit}]`, "of the fit"],
+        time.map((t, i) => [t, p.history[i], p.fitted]))));
 }
 
 views.replay = async (state) => {

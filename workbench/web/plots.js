@@ -77,7 +77,11 @@ class SeriesPlot {
     this.observer.observe(host);
   }
   get plot() { return this.plots[0] || null; }
-  height(panel) { return this.low ? 168 + 24 * panel : this.panels ? 225 : this.host.clientWidth < 600 ? 270 : 300; } /* a panel is as high as the label of its axis is long, also on a phone */
+  height(panel) {
+    if (this.low) return 168 + 24 * panel; /* it stays in sight above the places */
+    /* a panel is as high as the label of its axis is long, also on a phone */
+    return this.panels ? 225 : this.host.clientWidth < 600 ? 270 : 300;
+  }
   forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
@@ -113,7 +117,9 @@ class SeriesPlot {
     context.font = `${11 * px}px system-ui, sans-serif`;
     this.recordsIn(u.scales.x.min, u.scales.x.max).forEach(([from, name, began]) => {
       const x = u.valToPos(from, "x", true), { top, height } = u.bbox;
-      if (began) { context.beginPath(); context.moveTo(x, top); context.lineTo(x, top + height); context.stroke(); }
+      if (began) {
+        context.beginPath(); context.moveTo(x, top); context.lineTo(x, top + height); context.stroke();
+      }
       context.fillText(name, x + 4 * px, top + height - 5 * px);
     });
     context.restore();
@@ -135,6 +141,12 @@ class SeriesPlot {
       const left = index == null ? -10 : u.valToPos(this.data.time[index], "x");
       u.setCursor({ left, top: index == null ? -10 : u.over.clientHeight / 2 });
     }
+    this.stripAt(index == null ? null : this.data.time[index]);
+  }
+  /* The same moment in the whole record. */
+  stripAt(t) {
+    if (!this.small || this.strip.hidden) return;
+    this.small.setCursor({ left: t == null ? -10 : this.small.valToPos(t, "x"), top: 5 });
   }
   /* What an axis shows, on which side, in which unit; where series of several names share it, the legend has their names. */
   axisLabel(data, group, u) {
@@ -143,7 +155,8 @@ class SeriesPlot {
   }
   draw(data) {
     const { of, axis } = this.colours();
-    const letter = this.low || this.host.clientWidth < 600 ? { labelFont: "11px system-ui, sans-serif" } : {};
+    const small = this.low || this.host.clientWidth < 600;
+    const letter = small ? { labelFont: "11px system-ui, sans-serif" } : {};
     this.data = data; this.save.hidden = false;
     this.plots.forEach((p) => p.destroy());
     const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
@@ -182,9 +195,12 @@ class SeriesPlot {
       if (!(y1 > y0)) { y0 -= 1; y1 += 1; }
       const X = (t) => L + ((t - x0) / (x1 - x0)) * (W - L - R), Y = (v) => base - ((v - y0) / (y1 - y0)) * (base - top), word = (x, y, text, anchor = "middle") => svg("text", { x, y, "text-anchor": anchor, "font-size": 11, fill: ink }, text);
       for (const t of ticks(y0, y1, 4)) out.append(svg("path", { d: `M${L} ${Y(t)}H${W - R}`, stroke: "#cccccc", fill: "none" }), word(L - 5, Y(t) + 4, digits(t), "end"));
-      const across0 = (t, more) => svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: ink, fill: "none", ...more });
-      for (const t of (this.data.runs || []).filter((v) => v >= x0 && v <= x1)) out.append(across0(t, { "stroke-dasharray": "3 4" }));
-      for (const [t, name, began] of this.recordsIn(x0, x1)) out.append(...(began ? [across0(t)] : []), word(X(t) + 4, base - 5, name, "start"));
+      const begin = (t, dash) => svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: ink, fill: "none", "stroke-dasharray": dash });
+      for (const t of this.data.runs || []) if (t >= x0 && t <= x1) out.append(begin(t, "3 4"));
+      for (const [t, name, began] of this.recordsIn(x0, x1)) {
+        if (began) out.append(begin(t, "none"));
+        out.append(word(X(t) + 4, base - 5, name, "start"));
+      }
       for (const t of ticks(x0, x1, 8)) out.append(svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: "#cccccc", fill: "none" }), word(X(t), base + 15, digits(t, 5)));
       group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(Math.min(y1, Math.max(y0, s.values[i]))).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none", ...(noisy(s) ? { "stroke-dasharray": "2 3" } : {}) }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
       const across = (top + base) / 2, side = [...new Set(group.map((s) => s.unit))].map((u) => this.axisLabel(this.data, group, u)).join(", ");

@@ -40,8 +40,11 @@ function treeCard(state) {
     const both = draft.chosen.length === 2, held = h("div", { id: "held-against" });
     body.replaceChildren(...groups, h("div", { class: "row" }, button("Compare the two", () => get(`/view/fits?a=${draft.chosen[0]}&b=${draft.chosen[1]}`).then((found) => held.replaceChildren(fitsTable(found))).catch(fail), { work: false, id: "compare-fits", off: !both })), held);
   };
-  card.look = () => get("/view/tree")
-    .then((found) => keepingFocus(body, () => draw(found.branches))).catch(fail);
+  let asked = 0; /* an older answer does not come over a newer one */
+  card.look = () => {
+    const mine = (asked += 1), put = (found) => keepingFocus(body, () => draw(found.branches));
+    return get("/view/tree").then((found) => { if (mine === asked) put(found); }).catch(fail);
+  };
   card.look();
   return card;
 }

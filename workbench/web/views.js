@@ -95,7 +95,8 @@ const views = {
   },
 
   async compare(state) {
-    const found = await get(`/view/compare?${widthsAsked()}`), last = state.steps[state.steps.length - 1];
+    const found = await get(`/view/compare?${widthsAsked()}`);
+    const last = state.steps[state.steps.length - 1];
     const balances = Object.keys(found.error.balances), host = h("div", { class: "plot" });
     const draft = app.drafts.compare || (app.drafts.compare = {});
     let balance = balances.includes(draft.balance) ? draft.balance : found.worst.balance;
@@ -196,9 +197,13 @@ const views = {
     const link = (name, text, note) => h("div", { class: "card" }, h("h2", {}, text), h("p", { class: "soft" }, note), h("a", { class: "button primary", href: `${base()}/view/${name}`, download: "", id: `get-${name.replace(".", "-")}` }, "Download"));
     const made = (action, name, text, note, on, { fields, body } = {}) => h("div", { class: "card" }, h("h2", {}, sentence(text, "")), h("p", { class: "soft" }, note), on ? fields : null, on ? button(`Make the ${text}`, () => run(action, body || {}, () => { const a = h("a", { href: `${base()}/view/${name}`, download: "" }); document.body.append(a); a.click(); a.remove(); }), { kind: "primary", id: `make-${action}`, off: !fitted }) : h("p", { class: "small" }, "Not available in this installation."));
     const paper = app.drafts.report || (app.drafts.report = { author: "", notes: "" });
-    const said = (key) => ({ id: `report-${key}`, value: paper[key], oninput: (e) => { paper[key] = e.target.value; } });
-    const about = h("div", { class: "field" }, h("label", { for: "report-author" }, "Author"), h("input", { ...said("author"), autocomplete: "name" }),
-      h("label", { for: "report-notes" }, "Notes"), h("textarea", { ...said("notes"), class: "short", rows: "3", placeholder: "for the first page, as what was changed before" }));
+    const said = (key, more) => ({ id: `report-${key}`, value: paper[key], ...more,
+      oninput: (e) => { paper[key] = e.target.value; } });
+    const hint = "for the first page, as what was changed before";
+    const about = h("div", { class: "field" },
+      h("label", { for: "report-author" }, "Author"), h("input", said("author", { autocomplete: "name" })),
+      h("label", { for: "report-notes" }, "Notes"),
+      h("textarea", said("notes", { class: "short", rows: "3", placeholder: hint })));
     const copied = h("span", { class: "small good", role: "status" });
     return [heading("Take it home"), h("div", { class: "grid" },
       link("joint.toml", "Joint file", fitted ? "The joint with its fitted values, standard errors and provenance. It is a joint file again." + without : "The joint as it was described; nothing is fitted yet."),
@@ -294,5 +299,5 @@ function seriesCard(files) {
   draft.range = null; /* it was asked for once */
   later(() => plot.show(first).catch(fail));
   const pick = (id, label, options, chosen, key) => h("select", { id, "aria-label": label, onchange: (e) => { draft[key] = e.target.value; render(false); } }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t)));
-  return h("section", { class: "card" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host, leftOut(file, plot));
+  return h("section", { class: "card", id: "look" }, h("h2", {}, "Look at the records"), plotControls(plot, [pick("series-file", "Record", files.map((f) => [f.id, f.name]), file.id, "file"), pick("series-channel", "Channel", channels.map((c) => [c, c.replace(/_/g, " ")]), channel, "channel")]), host, leftOut(file, plot));
 }

@@ -10,7 +10,8 @@ const railed = () => WIDE.matches && app.view !== "home" && hasRecords(app.state
 
 /* What a picture may take: the width of a card in a grid of the view, and of a card by itself. */
 function columnWidths() {
-  const room = (app.drawn = pictureRoom()) + 30, least = railed() ? 306 : 346, count = Math.max(1, Math.floor((room + 16) / least));
+  const room = (app.drawn = pictureRoom()) + 30, least = railed() ? 306 : 346;
+  const count = Math.max(1, Math.floor((room + 16) / least));
   return { width: Math.floor((room - 16 * (count - 1)) / count - 38), whole: room - 38 };
 }
 const widthsAsked = () => new URLSearchParams(columnWidths());
@@ -20,6 +21,8 @@ const widthsAsked = () => new URLSearchParams(columnWidths());
 /* A record, or a run of it, in the plot of the Load page. */
 function lookAt(file, range) {
   app.drafts.series = { ...app.drafts.series, file, range };
+  const seen = () => { if ($("look")) $("look").scrollIntoView({ block: "center" }); };
+  later(() => requestAnimationFrame(seen));
   if (app.view === "load") render(false); else open("load");
 }
 const ROLES = { train: "fit", held_out: "held out" };
@@ -34,7 +37,8 @@ function recordLine(f) {
   return h("li", { class: "record" },
     shown ? button(f.name, () => lookAt(f.id, null), { kind: "quiet", work: false,
       id: `record-${f.id}`, label: `Look at ${f.name}` }) : h("span", {}, f.name),
-    h("p", { class: "small soft" }, said, bad ? h("span", { class: "warn" }, `, ${bad} to check`) : null),
+    h("p", { class: "small soft" }, said,
+      bad ? h("span", { class: "warn" }, `, ${bad} to check`) : null),
     runs.length ? h("div", { class: "row runs" }, h("span", { class: "small soft" }, "runs"),
       h("ol", { class: "row" }, runs.map(run))) : null);
 }
@@ -66,7 +70,8 @@ const lawPanel = () => { const node = $("law-panel"); return node && node.panel;
 function rightCards(state) {
   const d = state.diagnosis, inView = app.view === "diagnose";
   if (!d) return [h("section", { class: "card" }, h("h2", {}, "Candidates"),
-    h("p", { class: "soft small" }, "Diagnose tries every effect of the library in this model; what it ranks stands here."),
+    h("p", { class: "soft small" },
+      "Diagnose tries every effect of the library in this model; what it ranks stands here."),
     ["compare", "ledger", "diagnose"].includes(app.view) ? null
       : button("Diagnose", () => run("diagnose", {}, "diagnose"), { id: "rail-diagnose" }))];
   const { clear, faint } = rankedCards(d), own = rails.panel && rails.panel.node;
