@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
-from identification.balance.dataset import without
 from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.desk import tree
@@ -148,14 +148,11 @@ def addable(live: Live) -> list[dict[str, Any]]:
 
 
 def _needed(live: Live) -> set[str]:
-    """Effects of the model that cannot go, as another one in it builds on them."""
-    model, out = live.analysis().current.model, set()
-    for label in model.effects:
-        try:
-            without(model, label)
-        except (KeyError, ValueError):
-            out.add(label)
-    return out
+    """Effects of the model that cannot go: another one in it must have an effect of their kind."""
+    terms = live.analysis().current.model.terms
+    asked = {key for t in terms for key in t.effect.needs}
+    count = Counter(t.effect.key for t in terms)
+    return {t.label for t in terms if t.effect.key in asked and count[t.effect.key] == 1}
 
 
 def current_effects(state: State) -> list[str]:

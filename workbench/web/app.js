@@ -258,6 +258,13 @@ function keepingFocus(root, draw, moved) {
 /* Whether the screen shows the view that is open, as the state has it; the list of sessions is asked for again. */
 const drawnNow = (main) => Boolean(app.state) && app.view !== "home" && main.dataset.view === app.view && main.dataset.session === app.id && main.dataset.revision === String(app.state.revision);
 
+/* Plots of a drawing that another one overtook: nobody sees them, and they get no data any more. */
+function dropUnseen() {
+  const unseen = app.plots.filter((p) => p.host && !p.host.isConnected);
+  unseen.forEach((p) => p.destroy());
+  app.plots = app.plots.filter((p) => !unseen.includes(p));
+}
+
 /* Draw the view again; the focus stays on the same control. */
 function render(moved) {
   const where = moved ? 0 : scrollY;
@@ -269,7 +276,7 @@ function render(moved) {
   placeRails();
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
-    if (token !== app.token) return;
+    if (token !== app.token) { if (main.dataset.view) dropUnseen(); return; }
     keepingFocus(main, () => { /* the focus of now, not of when the drawing began */
       main.replaceChildren(...[nodes].flat(3).filter(Boolean));
       main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
@@ -279,6 +286,7 @@ function render(moved) {
       const after = app.after || [];
       app.after = [];
       after.forEach((f) => f());
+      dropUnseen();
     }, moved);
     scrollTo(0, where);
   }).catch(fail);

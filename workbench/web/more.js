@@ -97,11 +97,13 @@ function timeline(r) {
 /* A parameter as it was followed, beside the value of the fit. */
 function followed(name, p, time, end, stderr) {
   /* on a phone two stand beside one another */
-  const W = pictureWidth(WIDEST) < 480 ? 150 : 250, H = 100, L = 48, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
+  const W = pictureWidth(WIDEST) < 480 ? 150 : 250, H = 100, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
   const reach = [...known, p.fitted].filter((v) => v != null);
   let [y0, y1] = [Math.min(...reach), Math.max(...reach)];
   const least = 0.05 * Math.max(Math.abs(p.fitted ?? y1), 1e-12);
   if (y1 - y0 < least) { const c = (y0 + y1) / 2; y0 = c - least / 2; y1 = c + least / 2; }
+  const marks = ticks(y0, y1, 3).map((t) => [t, digits(t)]);
+  const L = 9 + 6.5 * Math.max(3, ...marks.map(([, text]) => text.length)); /* the axis has its room */
   const X = (t) => L + (t / end) * (W - L - R), Y = (v) => T + ((y1 - v) / (y1 - y0)) * (H - T - B);
   /* zero within its error: a share of it says nothing */
   const error = 1.96 * Math.max(stderr || 0, p.sigma || 0);
@@ -109,9 +111,9 @@ function followed(name, p, time, end, stderr) {
   const change = p.fitted && !none ? (100 * (p.value - p.fitted)) / Math.abs(p.fitted) : null;
   const said = `${words(name)}: ${digits(p.value, 4)} ${unit(p.unit)}${change == null ? "" : `, ${digits(change, 2)} percent from the fit`}`;
   const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": said });
-  for (const t of ticks(y0, y1, 3)) {
+  for (const [t, text] of marks) {
     out.append(svg("path", { class: "s-grid", d: `M${L} ${Y(t)}H${W - R}` }),
-      svg("text", { x: L - 4, y: Y(t) + 4, "text-anchor": "end" }, digits(t)));
+      svg("text", { x: L - 4, y: Y(t) + 4, "text-anchor": "end" }, text));
   }
   if (p.fitted != null) out.append(svg("path", { class: "s-ref", d: `M${L} ${Y(p.fitted)}H${W - R}` }));
   out.append(svg("path", { class: "s-thin", d: "M" + time.map((t, i) => [t, p.history[i]]).filter(([, v]) => v != null).map(([t, v]) => `${X(t)} ${Y(v)}`).join("L") }));

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,8 +27,10 @@ from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page import verbs as app_verbs
 from workbench.page import views as app_views
+from workbench.page.analysis import Analysis
 from workbench.page.export import _apart
 from workbench.page.input import add_upload, set_joint, start_demo
+from workbench.page.jobs import doing
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
@@ -302,6 +305,36 @@ def test_long_work_says_how_far_it_is_and_ends_when_cancelled(
 def test_a_build_says_what_went_wrong(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="what went wrong"):
         _apart("import sys; sys.exit('a line\\nwhat went wrong')", [], tmp_path)
+
+
+def test_author_and_notes_of_the_page_reach_the_report(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, Any] = {}
+    monkeypatch.setattr("workbench.page.export.improvement_of", lambda *_: None)
+    monkeypatch.setattr("workbench.page.export.records_of", lambda *_: ((), ()))
+    monkeypatch.setattr(
+        "workbench.show.report.write_report", lambda *_, **given: seen.update(given)
+    )
+    said = {"author": " R. Miller ", "notes": "new bearing"}
+    doing.export(live, "report", said, lambda *_: None)
+    assert (seen["author"], seen["notes"]) == ("R. Miller", "new bearing")
+
+
+def test_what_others_need_cannot_be_taken_out(live: Live) -> None:
+    needed = {row["label"] for row in app_verbs.addable(live) if row["needed"]}
+    assert "transmission_compliance" in needed
+    assert "structural_damping" not in needed
+
+
+def test_records_and_runs_laid_end_to_end_begin_where_they_do() -> None:
+    begins = ([True, False, True], [True, False, False])
+    rows = SimpleNamespace(axes={"time": SimpleNamespace(values=np.arange(6.0))})
+    data = SimpleNamespace(
+        held_out=[SimpleNamespace(begins=b) for b in begins], held_out_names=("a", "b")
+    )
+    made: Any = SimpleNamespace(rows=rows, data=data)
+    assert Analysis.laid_out(made) == ([(0.0, "a"), (3.0, "b")], [2.0])
 
 
 # --- uploads that are checked later ---------------------------------------------------------------
