@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], old: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -268,7 +268,7 @@ function dropUnseen() {
 /* Draw the view again; the focus stays on the same control. */
 function render(moved) {
   const where = moved ? 0 : scrollY;
-  app.plots.forEach((p) => p.destroy());
+  app.old.push(...app.plots); /* they stand until the new ones do: a plot would be blank for a moment */
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
@@ -279,6 +279,7 @@ function render(moved) {
     if (token !== app.token) { if (main.dataset.view) dropUnseen(); return; }
     keepingFocus(main, () => { /* the focus of now, not of when the drawing began */
       main.replaceChildren(...[nodes].flat(3).filter(Boolean));
+      app.old.splice(0).forEach((p) => p.destroy());
       main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
       document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
       drawRails();

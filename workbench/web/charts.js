@@ -176,7 +176,7 @@ function outcomeCard(d, claim, folded) {
   const kind = outcomeOf(d), words = app.config.words.outcomes[kind] || { headline: d.headline, next: "" };
   const said = words.next && h("p", { class: "next" }, h("strong", {}, "Next: "), words.next);
   const next = said || null;
-  const rest = folded ? h("details", {}, h("summary", {}, "Why, and what next"), folded, next) : next;
+  const rest = folded && (folded.length || next) ? h("details", {}, h("summary", {}, "Why, and what next"), folded, next) : next;
   return h("section", { class: `card outcome ${kind}`, "aria-label": "Outcome" }, claim, rest);
 }
 

@@ -26,7 +26,7 @@ function timelineCsv(r) {
 
 /* Each balance on one log axis: where it stood at the start, where it stands now, and the band that is noise. */
 function patternPlot(p) {
-  const W = pictureWidth(470), L = 96, R = 62, T = 22, row = 40, B = 40, H = T + row * p.balances.length + B;
+  const W = pictureWidth(pictureRoom() < 760 ? 760 : 470), L = 96, R = 62, T = 22, row = 40, B = 40, H = T + row * p.balances.length + B;
   const all = p.balances.flatMap((b) => [b.now, b.start]).filter((v) => v > 0), low = Math.min(0.5, ...all) * 0.9, high = Math.max(6, ...all) * 1.25;
   const X = (v) => L + (Math.log(Math.max(v, low) / low) / Math.log(high / low)) * (W - L - R);
   const said = p.balances.map((b) => `${b.name} ${digits(b.now)} times the noise`).join(", ");

@@ -69,7 +69,11 @@ const lawPanel = () => { const node = $("law-panel"); return node && node.panel;
 
 function rightCards(state) {
   const d = state.diagnosis, inView = app.view === "diagnose";
-  if (!d) return [h("section", { class: "card" }, h("h2", {}, "Candidates"),
+  const story = app.view === "ledger" ? null : state.improvement; /* that page says it itself */
+  if (!d) return [story && outcomeCard(story, [
+    h("p", { class: "figure" }, sentence(story.headline || story.verdict.replace(/_/g, " "))),
+    h("p", {}, sentence(story.reason))], []),
+  h("section", { class: "card" }, h("h2", {}, "Candidates"),
     h("p", { class: "soft small" },
       "Diagnose tries every effect of the library in this model; what it ranks stands here."),
     ["compare", "ledger", "diagnose"].includes(app.view) ? null
