@@ -136,6 +136,13 @@ def test_a_wide_screen_is_a_workspace_and_a_narrow_one_is_as_it_was(page: Any) -
     page.click("#rail-left .record button >> nth=1")
     idle(page, "load")
     assert page.input_value("#series-file") == page.evaluate("app.state.files[1].id")
+    of_runs = page.evaluate(
+        """() => { const f = structuredClone(app.state.files[1]);
+          f.summary.runs = [[0, 4], [4.5, 9]];
+          recordLine(f).querySelectorAll('ol button')[1].click(); return app.plots.length; }"""
+    )
+    assert of_runs == 1
+    page.wait_for_function("() => app.plots[0] && String(app.plots[0].range) === '4.5,9'")
     page.set_viewport_size({"width": 1000, "height": 860})
     go(page, "ledger")
     page.wait_for_selector("main #tree .fit.now")

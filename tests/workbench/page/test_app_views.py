@@ -22,6 +22,7 @@ import pytest
 
 pytest.importorskip("starlette")
 
+from identification.data.read import read
 from identification.errors import InputError
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
@@ -34,6 +35,7 @@ from workbench.page.jobs import doing
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
+from workbench.page.records import _summary
 from workbench.page.session import Session, Store
 from workbench.page.work import CancelledError, Task, Worker
 
@@ -372,6 +374,15 @@ def test_a_long_record_is_shown_before_it_is_checked(tmp_path: Path) -> None:
     assert live.state.files[0].findings
     table(live.session.files / "short.npz", 2_000)
     assert add_upload(live, "short.npz", "short.npz", 1)["status"] == "ready"
+
+
+def test_a_record_tells_its_runs_end_to_end(tmp_path: Path) -> None:
+    table(tmp_path / "two.npz", 2_000, jump=True)
+    runs = _summary(read(tmp_path / "two.npz"))["runs"]
+    assert [round(b - a, 3) for a, b in runs] == [0.999, 0.999]
+    assert runs[0][1] < runs[1][0]
+    table(tmp_path / "one.npz", 2_000)
+    assert _summary(read(tmp_path / "one.npz"))["runs"] == []
 
 
 def test_a_job_waits_for_the_check_and_a_check_that_fails_refuses_the_record(
