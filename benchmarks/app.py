@@ -438,7 +438,7 @@ def pictures(folder: Path) -> None:
             f"False, root=Path({sessions!r}))"
         )
         with served([sys.executable, "-c", code]) as (address, _), browser() as page:
-            page.set_viewport_size({"width": 1000, "height": 1400})
+            page.set_viewport_size({"width": 1440, "height": 1240})
             page.emulate_media(color_scheme="light", reduced_motion="reduce")
             page.goto(address)
 
@@ -454,11 +454,13 @@ def pictures(folder: Path) -> None:
             page.click("#demo")
             page.wait_for_selector("#fit:enabled", timeout=60_000)
             step("#fit", "compare")
-            page.screenshot(
-                path=str(folder / "page-compare.png"),
-                clip={"x": 0, "y": 102, "width": 1000, "height": 755},
-            )
             step("#diagnose", "diagnose")
+            step("#nav-compare", "compare")
+            page.wait_for_selector("#law-panel svg")
+            page.wait_for_timeout(1000)
+            page.screenshot(path=str(folder / "page-compare.png"))
+            page.set_viewport_size({"width": 1000, "height": 1400})
+            step("#nav-diagnose", "diagnose")
             step("button.primary:has-text('Add')", "ledger")
             step("#nav-replay", "replay")
             page.select_option("#replay-kind", "bias")

@@ -162,6 +162,41 @@ def test_no_effect_key_decides_anything_outside_the_declarations() -> None:
     assert wrong == []
 
 
+JS_TEST = re.compile(
+    r"""(?:[=!]==?|\.(?:includes|has|indexOf|startsWith|endsWith)\(|\bcase|new Set\()"""
+    r"""[\s(\[]*((?:["'`][^"'`]*["'`][\s,]*)+)|["'`]([^"'`]*)["'`]\s*[=!]==?"""
+    r"""|\[((?:["'`][^"'`]*["'`][\s,]*)+)\]"""
+)
+"""Words by which a page decides: compared, asked for, or listed."""
+
+
+def _decides_in_script(text: str) -> Iterator[tuple[int, str]]:
+    for found in JS_TEST.finditer(text):
+        line = text.count("\n", 0, found.start()) + 1
+        whole = found[1] or found[3]
+        words = re.findall(r"""["'`]([^"'`]*)["'`]""", whole) if whole else [found[2]]
+        yield from ((line, word) for word in words)
+
+
+def test_no_effect_key_decides_anything_in_the_scripts_of_the_page() -> None:
+    """What a page does with an effect comes with its declaration, from the server."""
+    from casadi_models import EFFECTS
+
+    labels = {f"{k}@{p}" for k, e in EFFECTS.items() for p in e.acts_on} | set(EFFECTS)
+    bad = 'if (e === "coulomb" || ["viscous", "gravity"].includes(k)) x.has("lugre")'
+    assert {w for _, w in _decides_in_script(bad)} == {"coulomb", "viscous", "gravity", "lugre"}
+    scripts = [p for f in ("web", "assets") for p in (ROOT / "workbench" / f).glob("*.js")]
+    assert len(scripts) > 10
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} {word!r}"
+        for path in scripts
+        if ".min." not in path.name
+        for line, word in _decides_in_script(path.read_text(encoding="utf-8"))
+        if word in labels
+    ]
+    assert wrong == []
+
+
 def test_no_parameter_name_or_ending_decides_anything_outside_the_declarations() -> None:
     from casadi_models import EFFECTS, Signals
     from casadi_models.term import HANGING, INERTIAS, smoothing

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Final
 
 from casadi_models.transmission import MODELS
@@ -9,6 +10,10 @@ from identification.data.channels import KINDS
 from identification.data.schema import Key, Schema
 
 SIDES: Final = ("motor", "link", "gear", "sensor", "none")
+START_EFFECTS: Final = ("viscous", "coulomb")
+"""Effects beyond the model's own that a new joint file begins with."""
+OFFERED_EFFECTS: Final = (*START_EFFECTS, "gravity")
+"""Effects that are offered first where a start model is put together."""
 
 JOINT: Final = Schema(
     "[joint]",
@@ -44,7 +49,7 @@ JOINT: Final = Schema(
             "names",
             "effects beyond the model's own: `key`, `key@place`, `key#2` for a second one",
             default=(),
-            example='effects = ["viscous", "coulomb"]',
+            example=f"effects = {json.dumps(START_EFFECTS)}",
         ),
         Key(
             "virtual_work",

@@ -45,6 +45,7 @@ from workbench.page.desk.curves import kept_curves
 from workbench.page.first import first_look
 from workbench.page.records import thinned
 from workbench.page.session import StepEntry
+from workbench.show.chart import WIDTH
 from workbench.show.pictures import place_chart
 from workbench.show.words import headline, title_of
 
@@ -430,20 +431,29 @@ class Analysis:
 
     # --- views ------------------------------------------------------------------------------------
 
-    def compare(self) -> dict[str, Any]:
-        """Error, and places with the most telling first, on the held-out records."""
+    def compare(self, width: int = WIDTH, whole: int = WIDTH) -> dict[str, Any]:
+        """Error, and places with the most telling first, on the held-out records.
+
+        Parameters
+        ----------
+        width, whole : int
+            Of a picture of a place, and of one that has a row of the page to itself.
+        """
         now = self.current
         rows = self.rows
         residual = self.residuals()
         found = places_of(residual, rows)
         assessed = self.assessed()
         error = self.bench.judged(now, assessed)
+        alone = sum(p.tells for p in found) <= 1
+        wide = [whole if alone and k == 0 else width for k in range(len(found))]
         out: dict[str, Any] = clean(
             {
                 "error": error.as_json(),
                 "places": [
-                    p.as_json() | {"tells": p.tells, "chart": place_chart(p).as_json()}
-                    for p in found
+                    p.as_json()
+                    | {"tells": p.tells, "chart": replace(place_chart(p), width=w).as_json()}
+                    for p, w in zip(found, wide, strict=True)
                 ],
                 "worst": self._worst(rows),
                 "records": list(self.data.held_out_names),
@@ -491,6 +501,20 @@ class Analysis:
         measured = references(self.data, self.data.held_out)[balance] + breaks
         time = self.rows.axes["time"].values
         return time, measured, measured - residual[balance], self.noise()[balance] + breaks
+
+    def laid_out(self) -> tuple[list[tuple[float, str]], list[float]]:
+        """Where each held-out record begins in the plot over time, with its name, and where each
+        further run of one does.
+        """
+        time, at = self.rows.axes["time"].values, 0
+        records, runs = [], []
+        for k, w in enumerate(self.data.held_out):
+            named = k < len(self.data.held_out_names)
+            records.append((float(time[at]), self.data.held_out_names[k] if named else ""))
+            starts = np.flatnonzero(w.begins)
+            runs += [float(time[at + int(i)]) for i in starts if i > 0]
+            at += len(w.begins)
+        return records, runs
 
     def parameters(self) -> dict[str, Any]:
         """Table of the parameters of the current model."""

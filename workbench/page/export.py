@@ -18,7 +18,7 @@ from identification.diagnosis.improve import HOLD_DELAY
 from identification.errors import InputError
 from workbench.page.analysis import Progress
 from workbench.page.desk.curves import story_of
-from workbench.page.jobs.place import Place, confirmed_map
+from workbench.page.jobs.place import Place, confirmed_map, folder_of
 from workbench.page.report import improvement_of, records_of
 from workbench.page.session import FileEntry, State, StepEntry, write_atomic
 
@@ -144,15 +144,33 @@ def fmu_available() -> bool:
     return importlib.util.find_spec("irj_fmu.build") is not None
 
 
-def report(live: Place, steps: Sequence[StepEntry], folder: Path, progress: Progress) -> Path:
-    """Write the HTML report of the session into a folder."""
+def report(
+    live: Place,
+    steps: Sequence[StepEntry],
+    progress: Progress,
+    *,
+    author: str = "",
+    notes: str = "",
+) -> Path:
+    """Write the HTML report of the session into its folder.
+
+    Parameters
+    ----------
+    live : Place
+    steps : sequence of StepEntry
+        The ledger.
+    progress : callable
+    author, notes : str
+        For the first page, as of ``irj report``.
+    """
     from workbench.show.report import write_report
 
     analysis = live.analysis()
     result = improvement_of(analysis, steps, progress)
     progress("writing the report", 0.95)
     train, held = records_of(analysis, steps)
-    return write_report(result, folder / "report.html", records=(*train, *held))
+    path = folder_of(live) / "report.html"
+    return write_report(result, path, records=(*train, *held), author=author, notes=notes)
 
 
 def fmu(live: Place, folder: Path, progress: Progress, kind: str = "plant") -> Path:

@@ -28,6 +28,8 @@ NO_COLUMN: Final = frozenset(("step", "formula"))
 """Keys of a map's entry that stand in place of a column."""
 WINDOW: Final = 6.0
 """Length of the windows of a thinned record [s]."""
+MOST_RUNS: Final = 200
+"""Runs that a plot marks, and a list of them has; more would hide the rest."""
 
 
 def guessed_role(name: str) -> tuple[str, str]:
@@ -208,11 +210,13 @@ def _plain(message: str, path: Path, name: str) -> str:
 
 def _summary(record: Record) -> dict[str, Any]:
     spans = {c: _span(v) for c, v in record.channels.items() if c != "run"}
-    step = record.dt
+    step, parts, time = record.dt, record.segments(), plot_time(record)
+    runs = [[float(time[p][0]), float(time[p][-1])] for p in parts[:MOST_RUNS] if len(time[p])]
     return {
         "samples": len(record),
         "duration": round(record.duration, 6),
-        "segments": len(record.segments()),
+        "segments": len(parts),
+        "runs": runs if len(parts) > 1 else [],
         "dt": step if math.isfinite(step) else None,
         "channels": [
             {"name": c, "unit": record.unit(c), "low": span[0], "high": span[1]}

@@ -77,6 +77,7 @@ PAGE: Final = {
     "/more.js": (WEB / "more.js", "text/javascript; charset=utf-8"),
     "/home.js": (WEB / "home.js", "text/javascript; charset=utf-8"),
     "/import.js": (WEB / "import.js", "text/javascript; charset=utf-8"),
+    "/workspace.js": (WEB / "workspace.js", "text/javascript; charset=utf-8"),
     "/tree.js": (WEB / "tree.js", "text/javascript; charset=utf-8"),
     "/preview.js": (WEB / "preview.js", "text/javascript; charset=utf-8"),
     "/known.js": (WEB / "known.js", "text/javascript; charset=utf-8"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -115,12 +116,13 @@ def wait_settled(live: Live, seconds: float = 30.0) -> None:
 
 
 def addable(live: Live) -> list[dict[str, Any]]:
-    """Effects of the library that can be added by hand, with title, place and whether they are
-    in the model.
+    """Effects of the library that can be added by hand, with title, place, whether they are in the
+    model, and whether another effect there needs them.
     """
     from casadi_models import EFFECTS
 
     inside = set(live.state.steps[-1].effects) if live.state.steps else set()
+    needed = _needed(live) if inside else set()
     joint = live.joint_or_none()
     linear = joint is not None and joint.kind == "linear"
     rows = []
@@ -139,9 +141,18 @@ def addable(live: Live) -> list[dict[str, Any]]:
                     "absence": e.absence,
                     "excitation": e.excitation,
                     "inside": label in inside,
+                    "needed": label in needed,
                 }
             )
     return rows
+
+
+def _needed(live: Live) -> set[str]:
+    """Effects of the model that cannot go: another one in it must have an effect of their kind."""
+    terms = live.analysis().current.model.terms
+    asked = {key for t in terms for key in t.effect.needs}
+    count = Counter(t.effect.key for t in terms)
+    return {t.label for t in terms if t.effect.key in asked and count[t.effect.key] == 1}
 
 
 def current_effects(state: State) -> list[str]:

@@ -18,12 +18,13 @@ from casadi_models.transmission import MODELS
 from identification.balance.dataset import HOLD_DELAY
 from identification.balance.kinematic import residual_unit
 from identification.data.channels import CHANNELS
+from identification.data.joint_schema import OFFERED_EFFECTS, START_EFFECTS
 from identification.diagnosis.lines import NORMAL_95
 from identification.errors import InputError
 from workbench.page import export as app_export
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
-from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of
+from workbench.page.charts.asked import CHART_VIEWS, along, run_starts, said, side_of, width_of
 from workbench.page.charts.choices import known_fields
 from workbench.page.charts.payload import payload_view
 from workbench.page.desk import tree
@@ -31,7 +32,7 @@ from workbench.page.input import joint_form
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
-from workbench.page.records import decimated, plot_time
+from workbench.page.records import MOST_RUNS, decimated, plot_time
 from workbench.page.session import safe_name
 from workbench.page.verbs import addable, wait_settled
 
@@ -52,6 +53,7 @@ def _config(live: Any, query: Query) -> dict[str, Any]:
             {"key": e.key, "title": e.title, "family": e.family, "places": list(e.acts_on)}
             for e in EFFECTS.values()
         ],
+        "start": {"effects": START_EFFECTS, "offered": OFFERED_EFFECTS},
         "words": said(),
         "report": app_export.report_available(),
         "fmu": app_export.fmu_available(),
@@ -111,7 +113,9 @@ def _balance(live: Live, query: Query) -> dict[str, Any]:
     unit = residual_unit(str(query.get("balance", "")), analysis.joint.kind)
     names = ("measured", "model", "residual", "noise, upper", "noise, lower")
     drawn = _drawn(stamps, names, [unit] * len(names), columns, full)
-    return {**drawn, "along": along(analysis, stamps)}
+    records, runs = analysis.laid_out()
+    begins = {"records": records, "runs": runs if len(runs) < MOST_RUNS else []}
+    return {**drawn, **begins, "along": along(analysis, stamps)}
 
 
 def _drawn(
@@ -150,7 +154,7 @@ def _numbers(values: Any) -> list[float | None]:
 
 def _compare(live: Live, query: Query) -> dict[str, Any]:
     analysis = live.analysis()
-    found = analysis.compare()
+    found = analysis.compare(width_of(query), width_of(query, "whole"))
     return {**found, "pattern": pattern(analysis, live.state.steps)}
 
 

@@ -2,7 +2,7 @@
 /* The page's state, its talk with the server, and what surrounds the views. */
 const VIEWS = [["load", "Load"], ["model", "Model"], ["compare", "Compare"], ["diagnose", "Diagnose"], ["ledger", "Improve"], ["parameters", "Parameters"], ["replay", "Replay"], ["plan", "Plan"], ["export", "Export"]];
 const $ = (id) => document.getElementById(id);
-const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
+const app = { id: null, config: null, state: null, view: "load", source: null, plots: [], old: [], cleanup: [], then: null, sent: false, doing: [], acted: Promise.resolve(), drafts: {}, draftsOf: null, preview: null, first: null, sending: null, upload: null };
 
 function h(tag, attributes, ...children) {
   const node = document.createElement(tag);
@@ -88,6 +88,7 @@ function gone(title, why, first) {
   main.replaceChildren(...heading(title, why),
     h("div", { class: "row" }, first, button("See the sessions", () => open("home"), { kind: first ? "" : "primary", work: false, id: "gone-home" }), button("Start a new session", () => act(fresh), { work: false, id: "gone-fresh" })));
   document.title = `${title} – Joint workbench`;
+  drawRails();
   main.focus({ preventScroll: true });
 }
 function clearError() { $("error").hidden = true; }
@@ -257,24 +258,36 @@ function keepingFocus(root, draw, moved) {
 /* Whether the screen shows the view that is open, as the state has it; the list of sessions is asked for again. */
 const drawnNow = (main) => Boolean(app.state) && app.view !== "home" && main.dataset.view === app.view && main.dataset.session === app.id && main.dataset.revision === String(app.state.revision);
 
+/* Plots of a drawing that another one overtook: nobody sees them, and they get no data any more. */
+function dropUnseen() {
+  const unseen = app.plots.filter((p) => p.host && !p.host.isConnected);
+  unseen.forEach((p) => p.destroy());
+  app.plots = app.plots.filter((p) => !unseen.includes(p));
+}
+
 /* Draw the view again; the focus stays on the same control. */
 function render(moved) {
   const where = moved ? 0 : scrollY;
-  app.plots.forEach((p) => p.destroy());
+  app.old.push(...app.plots); /* they stand until the new ones do: a plot would be blank for a moment */
   app.plots = [];
   const main = $("main");
   const token = (app.token = (app.token || 0) + 1);
   app.drawn = null; /* until a picture is drawn for the width there is */
+  placeRails();
   delete main.dataset.view; /* what is on the screen is the old one until the new one is drawn */
   Promise.resolve(views[app.view](app.state)).then((nodes) => {
-    if (token !== app.token) return;
+    if (token !== app.token) { if (main.dataset.view) dropUnseen(); return; }
     keepingFocus(main, () => { /* the focus of now, not of when the drawing began */
       main.replaceChildren(...[nodes].flat(3).filter(Boolean));
+      app.old.splice(0).forEach((p) => p.destroy());
       main.dataset.view = app.view; main.dataset.session = app.id || ""; main.dataset.revision = app.state ? app.state.revision : "";
       document.title = `${(VIEWS.find((v) => v[0] === app.view) || ["", "Sessions"])[1]} – Joint workbench`;
+      drawRails();
       surround();
-      (app.after || []).forEach((f) => f());
+      const after = app.after || [];
       app.after = [];
+      after.forEach((f) => f());
+      dropUnseen();
     }, moved);
     scrollTo(0, where);
   }).catch(fail);
@@ -349,6 +362,7 @@ async function boot() {
   const dark = matchMedia("(prefers-color-scheme: dark)"), wished = () => remembered("irj-theme") || (dark.matches ? "dark" : "light");
   theme(wished());
   dark.addEventListener("change", () => { theme(wished()); render(false); });
+  WIDE.addEventListener("change", () => { if (app.view) render(false); });
   let turned = null;
   addEventListener("resize", () => { clearTimeout(turned); turned = setTimeout(() => { showStep(); if (app.drawn && Math.abs(pictureRoom() / app.drawn - 1) > 0.1) render(false); }, 200); }); /* of a phone that was turned, pictures are drawn anew: their letters would shrink or be cut */
   $("theme").addEventListener("click", () => { const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark"; remembered("irj-theme", next); theme(next); render(false); });

@@ -1,6 +1,6 @@
 "use strict";
 /* Charts that the server draws (workbench/show/chart.py): put on the page, with a cursor, a brush, and their files. */
-const linked = { charts: [], marks: [], plot: null };
+const linked = { charts: [], marks: [], plot: null, pointed: null };
 
 /* Save text or a blob under a name. */
 function saveAs(content, name, kind) {
@@ -75,7 +75,7 @@ class ServedChart {
       this.line = svg("path", { class: "s-cursor", "data-live": "1", d: "" });
       made.append(this.area, this.line);
       made.addEventListener("pointermove", (e) => this.move(e));
-      made.addEventListener("pointerleave", () => { this.line.setAttribute("d", ""); });
+      made.addEventListener("pointerleave", () => { this.cursor(null); this.point(null); });
       if (this.brush) {
         made.addEventListener("pointerdown", (e) => { this.from = this.valueAt(e); made.setPointerCapture(e.pointerId); e.preventDefault(); });
         made.addEventListener("pointerup", (e) => { if (this.from == null) return; const to = this.valueAt(e), from = this.from; this.from = null; this.choose(Math.abs(this.X(to) - this.X(from)) < 4 ? null : [Math.min(from, to), Math.max(from, to)]); });
@@ -98,8 +98,34 @@ class ServedChart {
   move(e) {
     const v = this.valueAt(e), f = this.spec.frame, box = this.picture.getBoundingClientRect(), up = ((e.clientY - box.top) / box.height) * f.height;
     this.cursor(v);
+    this.point(v);
     if (this.from != null) this.shade([Math.min(this.from, v), Math.max(this.from, v)]);
     this.said.textContent = `${digits(v)} | ${digits(f.y[1] - ((up - f.top) / (f.bottom - f.top)) * (f.y[1] - f.y[0]))}`;
+  }
+  /* The other plots stand at the same moment: the one of the time plot's window whose value of this
+     signal is nearest; where none is near, the one of the whole record, which the strip shows. */
+  point(v) {
+    const { plot } = linked;
+    if (!this.axis || !plot || !plot.data) return;
+    plot.pointAt(null);
+    if (v == null) return;
+    const seenIn = (data) => (this.axis === "time" ? data.time : data.along[this.axis] || []);
+    const nearest = (data, [low, high]) => {
+      const seen = seenIn(data);
+      let best = -1;
+      for (let k = 0; k < seen.length; k++) {
+        if (seen[k] == null || data.time[k] < low || data.time[k] > high) continue;
+        if (best < 0 || Math.abs(seen[k] - v) < Math.abs(seen[best] - v)) best = k;
+      }
+      return best;
+    };
+    const [low, high] = this.spec.frame.x, here = nearest(plot.data, plot.range || plot.full);
+    const near = here >= 0 && Math.abs(seenIn(plot.data)[here] - v) < (high - low) / 50;
+    linked.pointed = this;
+    if (near) plot.pointAt(here);
+    else cursorInCharts(plot.whole)(nearest(plot.whole, plot.full));
+    if (!near) plot.stripAt(plot.whole.time[nearest(plot.whole, plot.full)]);
+    linked.pointed = null;
   }
   shade(range) {
     const a = range ? this.X(range[0]) : 0, b = range ? this.X(range[1]) : 0;
@@ -135,7 +161,7 @@ function markInTime(axis) {
 
 /* The cursor of the time plot in every chart over a signal. */
 function cursorInCharts(data) {
-  return (index) => linked.charts.forEach((c) => { if (c.axis && c.line) c.cursor(index == null ? null : c.axis === "time" ? data.time[index] : data.along && data.along[c.axis] ? data.along[c.axis][index] : null); });
+  return (index) => linked.charts.forEach((c) => { if (c.axis && c.line && c !== linked.pointed) c.cursor(index == null ? null : c.axis === "time" ? data.time[index] : data.along && data.along[c.axis] ? data.along[c.axis][index] : null); });
 }
 const forgetCharts = () => { linked.charts = []; linked.marks = []; linked.plot = null; };
 
@@ -146,9 +172,12 @@ function outcomeOf(d) {
   if (["unexplained", "not_identifiable"].includes(d.verdict)) return d.verdict;
   return d.outcome || "complete";
 }
-function outcomeCard(d, claim) {
+function outcomeCard(d, claim, folded) {
   const kind = outcomeOf(d), words = app.config.words.outcomes[kind] || { headline: d.headline, next: "" };
-  return h("section", { class: `card outcome ${kind}`, "aria-label": "Outcome" }, claim, words.next ? h("p", { class: "next" }, h("strong", {}, "Next: "), words.next) : null);
+  const said = words.next && h("p", { class: "next" }, h("strong", {}, "Next: "), words.next);
+  const next = said || null;
+  const rest = folded && (folded.length || next) ? h("details", {}, h("summary", {}, "Why, and what next"), folded, next) : next;
+  return h("section", { class: `card outcome ${kind}`, "aria-label": "Outcome" }, claim, rest);
 }
 
 /* A term with its meaning, from the one glossary. */
@@ -165,19 +194,21 @@ function glossaryCard() {
 /* One picture beside the ranking: the law of the candidate that is pointed at. They are fetched ahead, so that pointing is at once. */
 class LawPanel {
   constructor(labels, note = "line: what the law would take off it. Point at a candidate to see its law.") {
-    this.kept = new Map(); this.shown = null; this.step = app.state.steps.at(-1).id;
+    this.kept = new Map(); this.shown = null; this.step = app.state.steps.at(-1).id; this.labels = labels;
     this.title = h("h2", {}, "The law through the residual");
     this.host = h("div", { "aria-live": "polite" }, h("p", { class: "soft small" }, "Drawing …"));
     this.node = h("aside", { class: "card law-panel", id: "law-panel" }, this.title, h("p", { class: "soft small" }, `◆ residual of the model as it stands; ${note}`), this.host);
-    later(() => this.ahead(labels).catch(fail));
+    this.node.panel = this;
   }
+  begin() { this.ahead(this.labels).catch(fail); }
   async ahead(labels) {
     for (const label of labels) { if (!this.node.isConnected) return; await this.fetch(label).catch(() => null); if (!this.shown) this.show(label); }
   }
   fetch(label) {
-    if (!this.kept.has(label)) this.kept.set(label, get(`/view/law?label=${encodeURIComponent(label)}&step=${this.step}`).then((made) => { if (!made.stale) this.kept.set(label, made); return made; }));
+    if (!this.kept.has(label)) this.kept.set(label, get(`/view/law?label=${encodeURIComponent(label)}&step=${this.step}${this.wide()}`).then((made) => { if (!made.stale) this.kept.set(label, made); return made; }));
     return Promise.resolve(this.kept.get(label));
   }
+  wide() { return this.host.clientWidth ? `&width=${this.host.clientWidth}` : ""; }
   show(label) {
     this.shown = label;
     const ready = this.kept.get(label), put = (made) => { if (this.shown === label && !made.stale) { this.host.replaceChildren(h("p", {}, h("strong", {}, made.title)), made.drawn === false ? h("p", { class: "note small", id: "no-line" }, NO_LINE) : "", new ServedChart(made.chart, { name: `${made.title} through the residual` }).node); this.node.dataset.label = label; } };
@@ -186,7 +217,10 @@ class LawPanel {
 }
 
 /* What a list needs so that pointing at an item, or the focus on it, draws its law. */
-const pointsAt = (panel, label) => ({ "data-label": label, onpointerenter: () => panel.show(label), onfocusin: () => panel.show(label) });
+const pointsAt = (label) => {
+  const show = () => { const panel = lawPanel(); if (panel) panel.show(label); };
+  return { "data-label": label, onpointerenter: show, onfocusin: show };
+};
 const NO_LINE = "No line: on all these rows together the learned curves take nothing off. They were learned where the joint moves steadily.";
 const LEARNED_NOTE = "line: what the learned curves of this balance take off it together. Point at a curve to see it.";
 
@@ -197,15 +231,25 @@ function againstCard(files) {
   const channels = file.summary.channels.map((c) => c.name), titles = (list) => list.map((c) => [c, c.replace(/_/g, " ")]), host = h("div", {}), legend = h("p", { class: "small soft" });
   const torque = channels.find((c) => /torque|current/.test(c)), moving = channels.find((c) => /velocity/.test(c)) || channels.find((c) => /position/.test(c));
   const now = { x: channels.includes(draft.x) || draft.x === "time_in_run" ? draft.x : moving || channels[0], y: channels.includes(draft.y) ? draft.y : torque || channels[channels.length - 1], colour: channels.includes(draft.colour) ? draft.colour : "", other: files.some((f) => f.id === draft.other) ? draft.other : "" };
+  /* What colours the points is a third signal of one record, across a signal. */
+  const plain = () => now.other || now.x === "time_in_run";
+  const allow = () => {
+    const select = box.querySelector("#against-colour"), why = box.querySelector("#against-why");
+    select.disabled = Boolean(plain());
+    why.hidden = !plain();
+  };
   const draw = async () => {
     const query = new URLSearchParams({ file: file.id, ...now, width: String(Math.round(pictureWidth(760))) });
     const made = await get(`/view/against?${query}`);
     host.replaceChildren(new ServedChart(made.chart, { name: `${now.y} against ${now.x}` }).node);
     legend.textContent = made.legend.join("; ");
   };
-  const pick = (key, label, options) => h("label", { class: "small pick" }, label, h("select", { id: `against-${key}`, onchange: (e) => { draft[key] = e.target.value; if (key === "file") render(false); else { now[key] = e.target.value; draw().catch(fail); } } }, options.map(([v, t]) => h("option", { value: v, selected: v === (key === "file" ? file.id : now[key]) }, t))));
+  const pick = (key, label, options) => h("label", { class: "small pick" }, label, h("select", { id: `against-${key}`, "aria-describedby": key === "colour" ? "against-why" : null, onchange: (e) => { draft[key] = e.target.value; if (key === "file") render(false); else { now[key] = e.target.value; allow(); draw().catch(fail); } } }, options.map(([v, t]) => h("option", { value: v, selected: v === (key === "file" ? file.id : now[key]) }, t))));
   const box = h("details", { class: "card", id: "against", open: Boolean(draft.open), ontoggle: (e) => { draft.open = e.target.open; if (e.target.open && !host.childNodes.length) draw().catch(fail); } }, h("summary", {}, "Any signal against any"),
-    h("div", { class: "row" }, pick("file", "Record", files.map((f) => [f.id, f.name])), pick("x", "Across", [["time_in_run", "time, runs over each other"], ...titles(channels)]), pick("y", "Up", titles(channels)), pick("colour", "Coloured by", [["", "nothing"], ...titles(channels)]), pick("other", "Over it", [["", "no other record"], ...files.filter((f) => f.id !== file.id).map((f) => [f.id, f.name])])), host, legend);
+    h("div", { class: "row" }, pick("file", "Record", files.map((f) => [f.id, f.name])), pick("x", "Across", [["time_in_run", "time, runs over each other"], ...titles(channels)]), pick("y", "Up", titles(channels)), pick("colour", "Coloured by", [["", "nothing"], ...titles(channels)]), pick("other", "Over it", [["", "no other record"], ...files.filter((f) => f.id !== file.id).map((f) => [f.id, f.name])])),
+    h("p", { class: "small soft", id: "against-why" }, "Colour needs one record across a signal: over",
+      " time, and with a second record, the colours tell the records apart."), host, legend);
+  allow();
   return box;
 }
 
@@ -216,7 +260,17 @@ const held = (values) => act(async () => { await post("/joint", { hold: values, 
 function leftOut(file, plot) {
   const windows = file.left_out || [], put = (list) => act(async () => { await post(`/file/${file.id}`, { left_out: list }); await refresh(); });
   plot.marks = () => windows;
-  return h("div", { class: "row under", id: "left-out" }, button("Leave out this window", () => { if (plot.range) put([...windows, plot.range]); else fail(new Error("drag across the plot first: the window that is shown is left out")); }, { kind: "quiet", id: "leave-out" }),
+  const only = () => {
+    if (!plot.range) {
+      fail(new Error("drag across the plot first: what is shown is fitted, all else left out"));
+      return;
+    }
+    const [low, high] = plot.full, [a, b] = plot.range;
+    put([...windows, [low, a], [b, high]].filter(([from, to]) => to > from));
+  };
+  return h("div", { class: "row under", id: "left-out" },
+    button("Fit only this window", only, { kind: "quiet", id: "fit-only" }),
+    button("Leave out this window", () => { if (plot.range) put([...windows, plot.range]); else fail(new Error("drag across the plot first: the window that is shown is left out")); }, { kind: "quiet", id: "leave-out" }),
     windows.map(([a, b], k) => button(`Take back ${digits(a, 4)} to ${digits(b, 4)} s`, () => put(windows.filter((_, n) => n !== k)), { kind: "quiet", id: `take-back-${k}` })));
 }
 

@@ -40,6 +40,7 @@ function knownCard(rows, added) {
     const row = others.find((r) => r.name === pick.value);
     if (!row) return;
     added.push(row.name);
+    storeDraft(app.drafts.joint);
     list.append(knownRow(row, "known"));
     pick.querySelector(`option[value="${row.name}"]`).remove();
     $(`known-${row.name}-value`).focus();
@@ -66,14 +67,34 @@ const fieldsTyped = (draft) => Object.keys(draft.typed).filter((key) => key !== 
 
 /* What is edited on the Model page: on which text it began, what was typed, which known parameters were added. It stays until it is saved or given up, also where the joint becomes another one meanwhile. */
 function jointDraft(text) {
-  const draft = app.drafts.joint;
+  const draft = app.drafts.joint || (app.drafts.joint = storedDraft());
   if (draft && (draft.text === text || draft.saving || draft.added.length || "joint-text" in draft.typed || fieldsTyped(draft).length)) return draft;
   return (app.drafts.joint = { text, typed: {}, added: [], saving: false });
 }
 
+/* It also stays where the page is loaded anew, in this tab. */
+const draftKey = () => `irj-joint-${app.id}`;
+function storedDraft() {
+  try {
+    const found = JSON.parse(sessionStorage.getItem(draftKey()) || "null");
+    return found && { ...found, saving: false };
+  } catch (error) { return null; }
+}
+function storeDraft({ text, typed, added }) {
+  const nothing = !added.length && !Object.keys(typed).length;
+  try {
+    if (nothing) sessionStorage.removeItem(draftKey());
+    else sessionStorage.setItem(draftKey(), JSON.stringify({ text, typed, added }));
+  } catch (error) { /* a browser that keeps nothing: it stays until the page goes */ }
+}
+
 /* Another tab, another page or a joint file changed the joint while it was edited here: nothing is saved over it, and nothing typed goes, until it is said which counts. */
 function movedJoint(draft, text) {
-  const taken = (drop) => { if (drop) delete app.drafts.joint; else draft.text = text; clearError(); render(false); };
+  const taken = (drop) => {
+    if (drop) delete app.drafts.joint; else draft.text = text;
+    if (drop) storeDraft({ typed: {}, added: [] });
+    clearError(); render(false);
+  };
   return h("section", { class: "note", id: "joint-moved", role: "status" },
     h("p", {}, h("strong", {}, "The joint was changed elsewhere"), " since you began to edit it: in another tab, on another page or by a joint file. What you typed still stands below and is not saved."),
     h("details", {}, h("summary", {}, "The joint as it is now"), h("pre", { tabindex: "0", "aria-label": "The joint as it is now" }, text)),

@@ -5,11 +5,28 @@ const words = (name) => name.replace(/#\d+/g, "").replace(/_delay_0$/, "_delay")
 const field = (id, label, value, hint, more) => h("div", { class: "field" }, h("label", { for: id }, label), h("input", { id, value: value == null ? "" : String(value), "aria-describedby": `${id}-hint`, autocomplete: "off", inputmode: "decimal", ...more }), h("span", { class: "small soft", id: `${id}-hint` }, hint));
 const choice = (id, label, options, chosen, hint, onchange, size = "") => h("div", { class: `field ${size}` }, h("label", { for: id }, label), h("select", { id, onchange, "aria-describedby": hint ? `${id}-hint` : null }, options.map(([v, t]) => h("option", { value: v, selected: v === chosen }, t))), hint && h("span", { class: "small soft", id: `${id}-hint` }, hint));
 
+/* A picture with Save under it, as under every plot. */
+function kept(name, picture, table) {
+  const save = saver(name, () => svgFile(picture), table);
+  return [picture, h("div", { class: "row under end" }, save)];
+}
+const csvCell = (v) => {
+  const text = v == null ? "" : String(v);
+  return /[",\n]/.test(text) ? `"${text.replace(/"/g, '""')}"` : text;
+};
+const csvLine = (row) => row.map(csvCell).join(",") + "\n";
+const csvOf = (head, rows) => [head, ...rows].map(csvLine).join("");
+function timelineCsv(r) {
+  const score = (name, i) => (r.score[name] || [])[i];
+  return csvOf(["time [s]", ...r.readings.map((n) => `${n}, share of the limit`), "replaced"],
+    r.time.map((t, i) => [t, ...r.readings.map((n) => score(n, i)), r.failed[i].join(" ")]));
+}
+
 /* --- physics or sensor ---------------------------------------------------------------------------------------- */
 
 /* Each balance on one log axis: where it stood at the start, where it stands now, and the band that is noise. */
 function patternPlot(p) {
-  const W = pictureWidth(470), L = 96, R = 62, T = 22, row = 40, B = 40, H = T + row * p.balances.length + B;
+  const W = pictureWidth(pictureRoom() < 760 ? 760 : 470), L = 96, R = 62, T = 22, row = 40, B = 40, H = T + row * p.balances.length + B;
   const all = p.balances.flatMap((b) => [b.now, b.start]).filter((v) => v > 0), low = Math.min(0.5, ...all) * 0.9, high = Math.max(6, ...all) * 1.25;
   const X = (v) => L + (Math.log(Math.max(v, low) / low) / Math.log(high / low)) * (W - L - R);
   const said = p.balances.map((b) => `${b.name} ${digits(b.now)} times the noise`).join(", ");
@@ -32,7 +49,7 @@ function patternCard(p) {
   const names = p.balances.map((b) => b.name), fails = (b) => p.hit.includes(b), shared = p.readings.find((r) => r.shared);
   const moved = p.balances.some((b) => b.start != null && Math.abs(b.start - b.now) > 0.02 * b.now);
   return h("section", { class: "card", id: "pattern" }, h("h2", {}, "Physics or sensor?"), h("p", {}, p.sentence), h("div", { class: "two even" },
-    h("figure", {}, patternPlot(p), h("p", { class: "small soft" }, `◆ over the noise, ● at it${moved ? ", ○ at the start" : ""}. Those with structure left are averaged over ${digits(p.kernel_ms)} ms.`)),
+    h("figure", {}, kept("Physics or sensor", patternPlot(p), () => csvOf(["balance", "residual ÷ noise", "at the start"], p.balances.map((b) => [b.name, b.now, b.start]))), h("p", { class: "small soft" }, `◆ over the noise, ● at it${moved ? ", ○ at the start" : ""}. Those with structure left are averaged over ${digits(p.kernel_ms)} ms.`)),
     h("div", {}, h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Readings and balances" }, h("table", { class: "matrix" }, h("caption", {}, "Which reading enters which balance"), h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Reading"), names.map((b) => h("th", { scope: "col", class: fails(b) ? "hit" : null }, b, fails(b) ? h("span", { class: "hidden" }, ", over the noise") : null)))),
       h("tbody", {}, p.readings.map((r) => h("tr", { class: r.shared ? "now" : null }, h("th", { scope: "row" }, r.name), names.map((b) => h("td", { class: fails(b) ? "hit" : null }, r.balances.includes(b) ? [h("span", { "aria-hidden": "true" }, "●"), h("span", { class: "hidden" }, "enters")] : h("span", { class: "hidden" }, "–")))))))),
       h("p", { class: "small soft" }, p.balances.length === 1 ? "With one balance only, physics and sensor look alike. A link encoder or a torque sensor beside it would tell them apart." : shared ? `The ${shared.name} is the one reading that all failing balances share, and no other: look at that sensor first.` : p.hit.length === 1 ? "A sensor that reads wrong spoils every balance it enters. Here one balance fails alone, so physics on that side is more likely." : p.hit.length ? "No single reading is shared by just these balances: more than one thing is missing, or physics on both sides." : "A sensor that reads wrong would lift every balance that it enters."))));
@@ -78,21 +95,33 @@ function timeline(r) {
 }
 
 /* A parameter as it was followed, beside the value of the fit. */
-function followed(name, p, time, end) {
+function followed(name, p, time, end, stderr) {
   /* on a phone two stand beside one another */
-  const W = pictureWidth(WIDEST) < 700 ? 150 : 250, H = 92, L = 6, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
+  const W = pictureWidth(WIDEST) < 480 ? 150 : 250, H = 100, R = 6, T = 8, B = 20, known = p.history.filter((v) => v != null);
   const reach = [...known, p.fitted].filter((v) => v != null);
   let [y0, y1] = [Math.min(...reach), Math.max(...reach)];
   const least = 0.05 * Math.max(Math.abs(p.fitted ?? y1), 1e-12);
   if (y1 - y0 < least) { const c = (y0 + y1) / 2; y0 = c - least / 2; y1 = c + least / 2; }
+  const marks = ticks(y0, y1, 3).map((t) => [t, digits(t)]);
+  const L = 9 + 6.5 * Math.max(3, ...marks.map(([, text]) => text.length)); /* the axis has its room */
   const X = (t) => L + (t / end) * (W - L - R), Y = (v) => T + ((y1 - v) / (y1 - y0)) * (H - T - B);
-  const change = p.fitted ? (100 * (p.value - p.fitted)) / Math.abs(p.fitted) : null;
+  /* zero within its error: a share of it says nothing */
+  const error = 1.96 * Math.max(stderr || 0, p.sigma || 0);
+  const none = p.fitted != null && Math.abs(p.fitted) <= error;
+  const change = p.fitted && !none ? (100 * (p.value - p.fitted)) / Math.abs(p.fitted) : null;
   const said = `${words(name)}: ${digits(p.value, 4)} ${unit(p.unit)}${change == null ? "" : `, ${digits(change, 2)} percent from the fit`}`;
   const out = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": said });
+  for (const [t, text] of marks) {
+    out.append(svg("path", { class: "s-grid", d: `M${L} ${Y(t)}H${W - R}` }),
+      svg("text", { x: L - 4, y: Y(t) + 4, "text-anchor": "end" }, text));
+  }
   if (p.fitted != null) out.append(svg("path", { class: "s-ref", d: `M${L} ${Y(p.fitted)}H${W - R}` }));
   out.append(svg("path", { class: "s-thin", d: "M" + time.map((t, i) => [t, p.history[i]]).filter(([, v]) => v != null).map(([t, v]) => `${X(t)} ${Y(v)}`).join("L") }));
   out.append(svg("text", { x: L, y: H - 5 }, "0"), svg("text", { x: W - R, y: H - 5, "text-anchor": "end" }, seconds(end)));
-  return h("figure", { class: "spark" }, h("figcaption", {}, words(name), h("span", {}, `${digits(p.value, 4)} ± ${digits(p.sigma, 2)} ${unit(p.unit)}${change == null ? "" : ` · ${change >= 0 ? "+" : ""}${digits(change, 2)} % from the fit`}`)), out);
+  return h("figure", { class: "spark" }, h("figcaption", {}, words(name), h("span", {}, `${digits(p.value, 4)} ± ${digits(p.sigma, 2)} ${unit(p.unit)}${change == null ? "" : ` · ${change >= 0 ? "+" : ""}${digits(change, 2)} % from the fit`}${none ? " · zero within its error in the fit" : ""}`)),
+    kept(`${words(name)} as it was followed`, out,
+      () => csvOf(["time [s]", `${words(name)} [${p.unit}]`, "of the fit"],
+        time.map((t, i) => [t, p.history[i], p.fitted]))));
 }
 
 views.replay = async (state) => {
@@ -113,16 +142,17 @@ views.replay = async (state) => {
     button("Replay", go, { kind: "primary", id: "replay" }));
   const head = heading("Online replay", "The estimator that the FMU carries, fed sample by sample: what it would have said while the joint ran. It starts from the fitted joint, follows its parameters, and doubts readings that disagree with the others.");
   if (!last.time) return [head, live, form];
+  const table = await get("/view/parameters").catch(() => ({}));
   const stale = last.effects.join() !== state.steps[state.steps.length - 1].effects.join();
   const marks = last.verdicts.filter((v) => v.about.length), host = h("div", { class: "plot" });
   later(() => { const plot = new SeriesPlot(host, () => Promise.resolve({ time: last.time, full: true, series: Object.entries(last.ratio).map(([b, v]) => ({ name: b, unit: "× floor", values: v })) }), { title: "Residual over floor of each balance", local: true, side: "residual" }); app.plots.push(plot); plot.show(null).catch(fail); });
   const verdict = last.standing ? last.standing.replace(/\.$/, "") : !last.detector ? "Sensor faults were not looked for" : marks.length ? `${words(marks[0].about.join(" or "))}: ${marks[0].text.charAt(0).toLowerCase()}${marks[0].text.slice(1)}` : "No reading was doubted";
   return [head, live, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
     h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", { id: "standing" }, sentence(verdict)), ` ${last.record}, ${seconds(last.end)}${last.live ? " so far" : ""}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
-      timeline(last), h("p", { class: "small soft" }, "Shade: largest residual that holds the reading, as a share of its limit (full height: at the limit). Bar: declared failed and replaced by the estimate."),
+      kept("Fault timeline", timeline(last), () => timelineCsv(last)), h("p", { class: "small soft" }, "Shade: largest residual that holds the reading, as a share of its limit (full height: at the limit). Bar: declared failed and replaced by the estimate."),
       last.verdicts.length > 1 || marks.length ? h("details", { open: last.verdicts.length < 5 }, h("summary", {}, `What it said (${last.verdicts.length})`), h("ul", { class: "findings" }, last.verdicts.map((v) => h("li", {}, h("strong", {}, seconds(v.time)), " ", v.about.length ? `${words(v.about.join(", "))}: ` : "", v.text)))) : null),
     h("section", { class: "card" }, h("h2", {}, "Residual over floor"), h("p", { class: "soft small" }, "1 × means that only noise is left. It is the mean over the last two seconds."), host),
-    h("section", { class: "card" }, h("h2", {}, "Parameters as they were followed"), h("p", { class: "soft small" }, "Line: the online estimate; dashed: the value of the fit."), h("div", { class: "sparks" }, Object.entries(last.parameters).map(([n, p]) => followed(n, p, last.time, last.end))))];
+    h("section", { class: "card" }, h("h2", {}, "Parameters as they were followed"), h("p", { class: "soft small" }, "Line: the online estimate; dashed: the value of the fit."), h("div", { class: "sparks" }, Object.entries(last.parameters).map(([n, p]) => followed(n, p, last.time, last.end, (table[n] || {}).stderr))))];
 };
 
 /* --- planning ------------------------------------------------------------------------------------------------ */

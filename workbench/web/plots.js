@@ -36,7 +36,10 @@ function pictureWidth(most) {
   app.drawn = pictureRoom();
   return Math.min(most, app.drawn);
 }
-function pictureRoom() { return Math.max(280, Math.min(WIDEST, document.documentElement.clientWidth - 70)); }
+function pictureRoom() {
+  const most = railed() ? Infinity : WIDEST; /* beside the rails a card is as wide as there is room */
+  return Math.max(280, Math.min(most, ($("main").clientWidth || innerWidth) - 70));
+}
 
 /* What a step did; a set of names stays a set. */
 function stepName(step) {
@@ -63,18 +66,22 @@ const plotPoints = (width) => Math.max(200, Math.min(1600, Math.round(width)));
 class SeriesPlot {
   constructor(host, fetcher, { title, local, panels, side } = {}) {
     this.host = host; this.fetcher = fetcher; this.title = title || ""; this.local = Boolean(local); this.panels = panels || null; this.side = side || "";
-    this.range = null; this.asked = 0; this.plots = []; this.small = null; this.whole = null; this.marks = null; this.onCursor = null;
+    this.range = null; this.asked = 0; this.plots = []; this.small = null; this.whole = null; this.marks = null; this.onCursor = null; this.low = false;
     this.main = h("div"); this.strip = h("div", { class: "strip", hidden: true });
     this.save = h("div", { class: "row under end", hidden: true }, saver(this.title || "series", () => this.svg(), () => this.csv())); /* there is nothing to save before the data came */
     host.replaceChildren(this.main, this.strip, this.save);
     this.observer = new ResizeObserver(() => {
-      if (host.clientWidth) this.plots.forEach((p) => p.setSize({ width: host.clientWidth, height: this.height() }));
-      if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: 74 }); this.mark(); }
+      if (host.clientWidth) this.plots.forEach((p, k) => p.setSize({ width: host.clientWidth, height: this.height(k) }));
+      if (this.small && host.clientWidth) { this.small.setSize({ width: host.clientWidth, height: this.flat() }); this.mark(); }
     });
     this.observer.observe(host);
   }
   get plot() { return this.plots[0] || null; }
-  height() { return this.panels ? 225 : this.host.clientWidth < 600 ? 220 : 300; } /* a panel is as high as the label of its axis is long, also on a phone */
+  height(panel) {
+    if (this.low) return 168 + 24 * panel; /* it stays in sight above the places */
+    /* a panel is as high as the label of its axis is long, also on a phone */
+    return this.panels ? 225 : this.host.clientWidth < 600 ? 270 : 300;
+  }
   forget() { this.whole = null; if (this.small) { this.small.destroy(); this.small = null; } }
   async show(range) {
     this.range = range || null;
@@ -96,16 +103,51 @@ class SeriesPlot {
   /* The samples that a brush chose, and where a run begins. */
   shade(u) {
     const spans = this.marks ? this.marks() : [], begins = (this.data && this.data.runs) || [], context = u.ctx, css = getComputedStyle(document.documentElement);
-    if (!spans.length && !begins.length) return;
+    const records = (this.data && this.data.records) || [];
+    if (!spans.length && !begins.length && records.length < 2) return;
     context.save();
     context.beginPath(); context.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height); context.clip();
     context.fillStyle = css.getPropertyValue("--band-2").trim();
     for (const [a, b] of spans) { const x = u.valToPos(a, "x", true); context.fillRect(x, u.bbox.top, Math.max(1, u.valToPos(b, "x", true) - x), u.bbox.height); }
     context.strokeStyle = css.getPropertyValue("--soft").trim(); context.setLineDash([3, 4]);
     for (const t of begins) { const x = u.valToPos(t, "x", true); context.beginPath(); context.moveTo(x, u.bbox.top); context.lineTo(x, u.bbox.top + u.bbox.height); context.stroke(); }
+    context.setLineDash([]);
+    context.fillStyle = css.getPropertyValue("--ink").trim();
+    const px = devicePixelRatio || 1;
+    context.font = `${11 * px}px system-ui, sans-serif`;
+    this.recordsIn(u.scales.x.min, u.scales.x.max).forEach(([from, name, began]) => {
+      const x = u.valToPos(from, "x", true), { top, height } = u.bbox;
+      if (began) {
+        context.beginPath(); context.moveTo(x, top); context.lineTo(x, top + height); context.stroke();
+      }
+      context.fillText(name, x + 4 * px, top + height - 5 * px);
+    });
     context.restore();
   }
+  /* The records in a window, where they lie end to end: from where each is seen, its name, and
+     whether it begins there. */
+  recordsIn(low, high) {
+    const records = (this.data && this.data.records) || [];
+    if (records.length < 2) return [];
+    return records.map(([from, name], k) => [from, name, (records[k + 1] || [Infinity])[0]])
+      .filter(([from, , to]) => from <= high && to > low)
+      .map(([from, name]) => [Math.max(from, low), name, from >= low]);
+  }
   redraw() { this.plots.forEach((p) => p.redraw(false)); }
+  flat() { return this.low ? 56 : 74; } /* of the strip */
+  /* The cursor at a sample, as if it was pointed at here; none: nowhere. */
+  pointAt(index) {
+    for (const u of this.plots) {
+      const left = index == null ? -10 : u.valToPos(this.data.time[index], "x");
+      u.setCursor({ left, top: index == null ? -10 : u.over.clientHeight / 2 });
+    }
+    this.stripAt(index == null ? null : this.data.time[index]);
+  }
+  /* The same moment in the whole record. */
+  stripAt(t) {
+    if (!this.small || this.strip.hidden) return;
+    this.small.setCursor({ left: t == null ? -10 : this.small.valToPos(t, "x"), top: 5 });
+  }
   /* What an axis shows, on which side, in which unit; where series of several names share it, the legend has their names. */
   axisLabel(data, group, u) {
     const here = group.filter((s) => s.unit === u), what = this.panels ? (group.includes(data.series[0]) ? effort() : here[0].name) : here.length === 1 ? here[0].name.replace(/_/g, " ") : "";
@@ -113,6 +155,8 @@ class SeriesPlot {
   }
   draw(data) {
     const { of, axis } = this.colours();
+    const small = this.low || this.host.clientWidth < 600;
+    const letter = small ? { labelFont: "11px system-ui, sans-serif" } : {};
     this.data = data; this.save.hidden = false;
     this.plots.forEach((p) => p.destroy());
     const groups = this.panels ? this.panels.map((names) => data.series.filter((s) => names.includes(s.name))).filter((g) => g.length) : [data.series];
@@ -120,13 +164,13 @@ class SeriesPlot {
       const units = [...new Set(group.map((s) => s.unit))], last = panel === groups.length - 1;
       const beside = group.some(noisy) ? Object.fromEntries(units.map((u) => [u, { range: (p, low, high) => uPlot.rangeNum(...reach(group, low ?? 0, high ?? 0), 0.1, true) }])) : {};
       const made = new uPlot({
-        width: this.host.clientWidth || 800, height: this.height(), legend: { live: true }, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
+        width: this.host.clientWidth || 800, height: this.height(panel), legend: { live: true }, padding: this.low ? [22, null, null, null] : undefined, cursor: { drag: { x: true, y: false, setScale: false }, sync: this.panels ? { key: "series", setSeries: false } : undefined },
         scales: { x: { time: false, range: this.range ? () => this.range : undefined }, ...beside },
         series: [{ label: "time [s]", value: (u, v) => digits(v, 6) }, ...group.map((s) => { const k = data.series.indexOf(s); return {
           label: s.name.replace(/_/g, " ") + (unit(s.unit) ? ` [${unit(s.unit)}]` : ""), stroke: of(s, k), width: data.time.length < 600 ? 1.5 : 1, scale: s.unit, auto: !noisy(s),
           dash: s.name === "model" ? [6, 3] : noisy(s) ? [2, 3] : k % 2 && s.name !== "residual" ? [8, 3] : undefined, value: (u, v) => digits(v, 4), points: { show: data.full && data.time.length < 200 && !this.local && !noisy(s) },
         }; })],
-        axes: [{ ...axis, label: last ? "time [s]" : undefined, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: this.axisLabel(data, group, u), labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
+        axes: [{ ...axis, label: last ? "time [s]" : undefined, ...letter, labelSize: 20, size: last ? 40 : 24 }, ...units.map((u, k) => ({ ...axis, scale: u, side: k ? 1 : 3, label: this.axisLabel(data, group, u), ...letter, labelSize: 18, size: 58, grid: k ? { show: false } : axis.grid }))],
         hooks: { setSelect: [(u) => this.picked(u)], drawClear: [(u) => this.shade(u)], setCursor: [(u) => { if (this.onCursor) this.onCursor(u.cursor.left < 0 ? null : u.cursor.idx); }] },
       }, [data.time, ...group.map((s) => s.values)], this.main);
       made.over.addEventListener("dblclick", () => this.show(null).catch(fail));
@@ -151,6 +195,12 @@ class SeriesPlot {
       if (!(y1 > y0)) { y0 -= 1; y1 += 1; }
       const X = (t) => L + ((t - x0) / (x1 - x0)) * (W - L - R), Y = (v) => base - ((v - y0) / (y1 - y0)) * (base - top), word = (x, y, text, anchor = "middle") => svg("text", { x, y, "text-anchor": anchor, "font-size": 11, fill: ink }, text);
       for (const t of ticks(y0, y1, 4)) out.append(svg("path", { d: `M${L} ${Y(t)}H${W - R}`, stroke: "#cccccc", fill: "none" }), word(L - 5, Y(t) + 4, digits(t), "end"));
+      const begin = (t, dash) => svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: ink, fill: "none", "stroke-dasharray": dash });
+      for (const t of this.data.runs || []) if (t >= x0 && t <= x1) out.append(begin(t, "3 4"));
+      for (const [t, name, began] of this.recordsIn(x0, x1)) {
+        if (began) out.append(begin(t, "none"));
+        out.append(word(X(t) + 4, base - 5, name, "start"));
+      }
       for (const t of ticks(x0, x1, 8)) out.append(svg("path", { d: `M${X(t)} ${top}V${base}`, stroke: "#cccccc", fill: "none" }), word(X(t), base + 15, digits(t, 5)));
       group.forEach((s, n) => { let pen = "M"; const d = seen.map((i) => { if (s.values[i] == null) { pen = "M"; return ""; } const at = `${pen}${X(time[i]).toFixed(1)} ${Y(Math.min(y1, Math.max(y0, s.values[i]))).toFixed(1)}`; pen = "L"; return at; }).join(""); out.append(svg("path", { d, stroke: of(s, this.data.series.indexOf(s)), fill: "none", ...(noisy(s) ? { "stroke-dasharray": "2 3" } : {}) }), svg("text", { x: L + 150 * n, y: top - 6, "font-size": 11, fill: of(s, this.data.series.indexOf(s)) }, `${s.name.replace(/_/g, " ")}${unit(s.unit) ? ` [${unit(s.unit)}]` : ""}`)); });
       const across = (top + base) / 2, side = [...new Set(group.map((s) => s.unit))].map((u) => this.axisLabel(this.data, group, u)).join(", ");
@@ -164,7 +214,7 @@ class SeriesPlot {
     if (!this.small) {
       const { of, axis } = this.colours(), drawn = all.series.filter((s) => !noisy(s)), scales = Object.fromEntries([...new Set(drawn.map((s) => s.unit))].map((u) => [u, {}]));
       this.small = new uPlot({
-        width: this.host.clientWidth || 800, height: 74, legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
+        width: this.host.clientWidth || 800, height: this.flat(), legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false }, scales: { x: { time: false }, ...scales },
         series: [{}, ...drawn.map((s, k) => ({ stroke: of(s, k), width: 1, scale: s.unit, points: { show: false } }))],
         axes: [{ ...axis, size: 24 }, ...drawn.slice(0, 1).map((s) => ({ ...axis, scale: s.unit, size: 58, values: () => [] }))], hooks: { setSelect: [(u) => this.picked(u)] },
       }, [all.time, ...drawn.map((s) => s.values)], this.strip);

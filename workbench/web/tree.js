@@ -24,7 +24,7 @@ function treeCard(state) {
   const draft = app.drafts.tree || (app.drafts.tree = { chosen: [], noting: null });
   const body = h("div", { class: "tree" }), card = h("section", { class: "card", id: "tree", "aria-label": "Tree of fits" }, h("h2", {}, "Tree of fits"), h("p", { class: "small soft" }, "Every fit is kept. A changed record or joint begins a branch; nothing is deleted."), body);
   const go = (branch, step) => act(async () => { await post("/tree", { open: branch, step }); await refresh(); });
-  const write = (of, change) => act(async () => { await post("/tree", { of, ...change }); draft.noting = draft.note = null; await refresh(); render(false); /* it may have been drawn before the answer came */ });
+  const write = (of, change) => act(async () => { await post("/tree", { of, ...change }); draft.noting = draft.note = null; await refresh(); if (rails.tree === card) card.look(); else render(false); /* it may have been drawn before the answer came */ });
   const draw = (branches) => {
     const node = (n) => {
       const s = n.step, id = `fit-${s.id}`, noting = draft.noting === s.id, note = { name: s.remark.name || "", text: s.remark.note || "", ...(noting ? draft.note : null) };
@@ -40,7 +40,12 @@ function treeCard(state) {
     const both = draft.chosen.length === 2, held = h("div", { id: "held-against" });
     body.replaceChildren(...groups, h("div", { class: "row" }, button("Compare the two", () => get(`/view/fits?a=${draft.chosen[0]}&b=${draft.chosen[1]}`).then((found) => held.replaceChildren(fitsTable(found))).catch(fail), { work: false, id: "compare-fits", off: !both })), held);
   };
-  get("/view/tree").then((found) => draw(found.branches)).catch(fail);
+  let asked = 0; /* an older answer does not come over a newer one */
+  card.look = () => {
+    const mine = (asked += 1), put = (found) => keepingFocus(body, () => draw(found.branches));
+    return get("/view/tree").then((found) => { if (mine === asked) put(found); }).catch(fail);
+  };
+  card.look();
   return card;
 }
 
@@ -78,10 +83,11 @@ const pickLaw = (label) => act(async () => {
 function lawCard(state) {
   const draft = app.drafts.law || (app.drafts.law = { law: "", on: "motor", parameters: "" });
   const field = (key, label, placeholder, size) => h("input", { id: `law-${key}`, value: draft[key], placeholder, size, "aria-label": label, autocomplete: "off", spellcheck: "false", oninput: (e) => { draft[key] = e.target.value; delete draft.said; } });
+  const linear = effort() === "force"; /* the units of the axis */
   const place = h("select", { id: "law-on", "aria-label": "Where it acts", onchange: (e) => { draft.on = e.target.value; } }, app.config.places.map((p) => h("option", { value: p, selected: p === draft.on }, words(p))));
   const row = (t) => h("li", {}, h("div", { class: "row between" }, h("span", {}, h("code", {}, t.law), ` on ${t.on.replace(/_/g, " ")}: the held-out error ${t.after < t.before ? "falls" : "goes"} from ${digits(t.before)} to `, h("strong", {}, `${digits(t.after)} %`)),
     button("Add", () => run("add", { label: t.label }, "ledger"), { kind: t.after < t.before ? "primary" : "", id: `add-${t.label}`, label: `Add ${t.law}` })));
-  return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "c*tanh(v/w)", "28"), place, field("parameters", "Parameters with ranges and units", "c=0..10 N.m, w=0.01..1 rad/s", "34"),
-    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), draft.said ? h("p", { class: "small", id: "law-said" }, draft.said) : null, h("p", { class: "small soft" }, "Signals: q, v, a (angle, speed, acceleration of the place), twist, T, t; name your parameters otherwise. It is fitted at once to what the model leaves, and stays in the joint file."),
+  return h("form", { class: "card", id: "own-law", onsubmit: (e) => { e.preventDefault(); $("try-law").click(); } }, h("h2", {}, "A law of your own"), h("div", { class: "row" }, field("law", "Law", "c*tanh(v/w)", "28"), place, field("parameters", "Parameters with ranges and units", linear ? "c=0..10 N, w=0.01..1 m/s" : "c=0..10 N.m, w=0.01..1 rad/s", "34"),
+    button("Try it", () => run("law", { ...draft }), { id: "try-law" })), draft.said ? h("p", { class: "small", id: "law-said" }, draft.said) : null, h("p", { class: "small soft" }, `Signals: q, v, a (${linear ? "position" : "angle"}, speed, acceleration of the place), twist, T, t; name your parameters otherwise. It is fitted at once to what the model leaves, and stays in the joint file.`),
     state.laws.length ? h("ul", { class: "plain", id: "tried-laws" }, state.laws.map(row)) : null);
 }

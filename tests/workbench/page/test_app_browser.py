@@ -458,6 +458,15 @@ def test_pattern_replay_and_plan_by_clicks(
     browser.idle("replay")
     assert "torque: a sensor failed" in page.inner_text("#timeline").lower()
     assert page.locator("#timeline svg rect.s-fail").count() == 1
+    assert page.locator("#timeline details.save, .spark details.save").count() == (
+        1 + page.locator(".spark").count()
+    )
+    assert page.locator(".spark >> nth=0").locator("svg path.s-grid").count() > 0, "a y axis"
+    with page.expect_download() as lanes:
+        page.evaluate("document.querySelector('#timeline details.save').open = true")
+        page.click("#timeline details.save button:text-is('CSV')")
+    lanes.value.save_as(tmp_path / "timeline.csv")
+    assert "torque" in (tmp_path / "timeline.csv").read_text().splitlines()[-1]
     assert page.locator(".spark").count() == len(
         page.evaluate("() => get('/view/replay').then((r) => Object.keys(r.last.parameters))")
     )

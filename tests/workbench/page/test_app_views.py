@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,16 +22,20 @@ import pytest
 
 pytest.importorskip("starlette")
 
+from identification.data.read import read
 from identification.errors import InputError
 from workbench.page import plan as app_plan
 from workbench.page import replay as app_replay
 from workbench.page import verbs as app_verbs
 from workbench.page import views as app_views
+from workbench.page.analysis import Analysis
 from workbench.page.export import _apart
 from workbench.page.input import add_upload, set_joint, start_demo
+from workbench.page.jobs import doing
 from workbench.page.jobs.place import folder_of
 from workbench.page.live import Live
 from workbench.page.pattern import pattern
+from workbench.page.records import _summary
 from workbench.page.session import Session, Store
 from workbench.page.work import CancelledError, Task, Worker
 
@@ -304,6 +309,36 @@ def test_a_build_says_what_went_wrong(tmp_path: Path) -> None:
         _apart("import sys; sys.exit('a line\\nwhat went wrong')", [], tmp_path)
 
 
+def test_author_and_notes_of_the_page_reach_the_report(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, Any] = {}
+    monkeypatch.setattr("workbench.page.export.improvement_of", lambda *_: None)
+    monkeypatch.setattr("workbench.page.export.records_of", lambda *_: ((), ()))
+    monkeypatch.setattr(
+        "workbench.show.report.write_report", lambda *_, **given: seen.update(given)
+    )
+    said = {"author": " R. Miller ", "notes": "new bearing"}
+    doing.export(live, "report", said, lambda *_: None)
+    assert (seen["author"], seen["notes"]) == ("R. Miller", "new bearing")
+
+
+def test_what_others_need_cannot_be_taken_out(live: Live) -> None:
+    needed = {row["label"] for row in app_verbs.addable(live) if row["needed"]}
+    assert "transmission_compliance" in needed
+    assert "structural_damping" not in needed
+
+
+def test_records_and_runs_laid_end_to_end_begin_where_they_do() -> None:
+    begins = ([True, False, True], [True, False, False])
+    rows = SimpleNamespace(axes={"time": SimpleNamespace(values=np.arange(6.0))})
+    data = SimpleNamespace(
+        held_out=[SimpleNamespace(begins=b) for b in begins], held_out_names=("a", "b")
+    )
+    made: Any = SimpleNamespace(rows=rows, data=data)
+    assert Analysis.laid_out(made) == ([(0.0, "a"), (3.0, "b")], [2.0])
+
+
 # --- uploads that are checked later ---------------------------------------------------------------
 
 
@@ -339,6 +374,15 @@ def test_a_long_record_is_shown_before_it_is_checked(tmp_path: Path) -> None:
     assert live.state.files[0].findings
     table(live.session.files / "short.npz", 2_000)
     assert add_upload(live, "short.npz", "short.npz", 1)["status"] == "ready"
+
+
+def test_a_record_tells_its_runs_end_to_end(tmp_path: Path) -> None:
+    table(tmp_path / "two.npz", 2_000, jump=True)
+    runs = _summary(read(tmp_path / "two.npz"))["runs"]
+    assert [round(b - a, 3) for a, b in runs] == [0.999, 0.999]
+    assert runs[0][1] < runs[1][0]
+    table(tmp_path / "one.npz", 2_000)
+    assert _summary(read(tmp_path / "one.npz"))["runs"] == []
 
 
 def test_a_job_waits_for_the_check_and_a_check_that_fails_refuses_the_record(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from identification.data.joint_file import parse_joint
+from identification.data.joint_schema import START_EFFECTS
 from identification.data.plain_text import tables_text
 from identification.data.survey import Seen, Survey, survey
 from identification.errors import InputError
@@ -108,6 +109,6 @@ def _table(name: str, kind: str, arguments: Namespace) -> dict[str, Any]:
         "gear_ratio": 1.0 if arguments.gear_ratio is None else arguments.gear_ratio,
         "motor_constant": arguments.motor_constant,
         "model": "hd1",
-        "effects": ["viscous", "coulomb"],
+        "effects": list(START_EFFECTS),
     }
     return {k: v for k, v in table.items() if v is not None}

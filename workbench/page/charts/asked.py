@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -26,7 +27,7 @@ from workbench.page.desk.curves import learned_of, story_of
 from workbench.page.desk.shape import nearest
 from workbench.page.jobs.place import hint_for
 from workbench.page.live import Live
-from workbench.page.records import plot_time
+from workbench.page.records import MOST_RUNS, plot_time
 from workbench.page.session import StepEntry
 from workbench.show.chart import WIDTH, Chart, Curve, Label, Style
 from workbench.show.pictures import (
@@ -52,8 +53,6 @@ SHADES: Final[tuple[Style, ...]] = ("after", "law", "ink", "before")
 RUN: Final = "time_in_run"
 SPANS: Final = 400
 """Stretches of time that a brushed piece of a curve is marked with at most."""
-MOST_RUNS: Final = 200
-"""Runs whose beginnings are marked; more would hide the signal."""
 SEEN: Final = 1e-4
 """Share of the largest change of squares under which a balance has not moved for the eye: 1 % of
 its size."""
@@ -77,11 +76,19 @@ def _number(query: Query, key: str) -> float:
     return value
 
 
-def _width(query: Query) -> int:
+def width_of(query: Query, key: str = "width") -> int:
+    """The width of a picture that a page asks for: as wide as it draws it, so that its letters are
+    as large as those of the page.
+
+    Raises
+    ------
+    InputError
+        No number.
+    """
     try:
-        return min(max(int(float(query.get("width", WIDTH))), 280), 900)
-    except ValueError:
-        raise InputError("width must be a number") from None
+        return min(max(int(float(query.get(key, WIDTH))), 280), 1200)
+    except (ValueError, OverflowError):
+        raise InputError(f"{key} must be a number") from None
 
 
 # --- the staircase and the place that told --------------------------------------------------------
@@ -111,7 +118,7 @@ def _staircase(live: Live, query: Query) -> dict[str, Any]:
         "floor": floor,
         "stairs": {
             "svg": staircase_picture(
-                values, floor, names, _width(query), effort_of(steps[-1].held_out)
+                values, floor, names, width_of(query), effort_of(steps[-1].held_out)
             ),
             "csv": staircase_csv(values, floor, names),
             "frame": None,
@@ -121,19 +128,18 @@ def _staircase(live: Live, query: Query) -> dict[str, Any]:
     last = next((k for k in range(len(steps) - 1, 0, -1) if steps[k].action == "add"), None)
     if last is not None:
         analysis = live.analysis()
-        out["told"] = _told(analysis, steps[last - 1], steps[last], names[last])
+        told = _told(analysis, steps[last - 1], steps[last], names[last])
+        out["told"] = _as_wide(told, query, "whole")
     return out
 
 
-def _told(
-    analysis: Analysis, before: StepEntry, after: StepEntry, name: str
-) -> dict[str, Any] | None:
+def _told(analysis: Analysis, before: StepEntry, after: StepEntry, name: str) -> dict[str, Any]:
     one, two = (_shown(analysis, s) for s in (before, after))
     fall = {b: float(np.nansum(one[b] ** 2) - np.nansum(two[b] ** 2)) for b in one if b in two}
     balance = max(fall, key=lambda b: fall[b])
     step = step_place(analysis.rows, name, balance, one, two)
     chart = place_chart(step.before, step.after, law=explained(step.before, step.after))
-    return {"name": name, "balance": balance, "chart": chart.as_json()}
+    return {"name": name, "balance": balance, "chart": chart}
 
 
 def _shown(analysis: Analysis, step: StepEntry) -> dict[str, FloatArray]:
@@ -164,16 +170,15 @@ def _law(live: Live, query: Query) -> dict[str, Any]:
     mark = (label, len(live.state.steps), live.state.steps[-1].label if live.state.steps else "")
     kept = live.kept.get(f"law {label}")
     if kept is not None and kept[0] == (mark, id(analysis.current)):
-        found: dict[str, Any] = kept[1]
-        return found
+        return _as_wide(kept[1], query)
     for story in (live.state.improvement, live.state.diagnosis):
         curve = learned_of(story, label)
         if story is not None and curve is not None:
-            chart = curve_chart(analysis, story, curve)
+            chart, drawn = curve_chart(analysis, story, curve)
             found = {"label": label, "title": title_of(label), "balance": curve["balance"]}
-            found |= {"chart": chart, "drawn": chart["law"]}
+            found |= {"chart": chart, "drawn": drawn}
             live.kept[f"law {label}"] = ((mark, id(analysis.current)), found)
-            return found
+            return _as_wide(found, query)
     before = shown_residual(analysis, analysis.current.model, analysis.current.values)
     made = analysis.with_candidate(label, hint_for(live.state, label))
     after = shown_residual(analysis, made.model, made.values)
@@ -181,10 +186,15 @@ def _law(live: Live, query: Query) -> dict[str, Any]:
     balance = str(row["balance"]) if row else max(before, key=lambda b: float(np.nanstd(before[b])))
     step = step_place(analysis.rows, label, balance, before, after)
     law = explained(step.before, step.after)
-    drawn = place_chart(step.before, law=law)
-    found = {"label": label, "title": title_of(label), "balance": balance, "chart": drawn.as_json()}
+    chart = place_chart(step.before, law=law)
+    found = {"label": label, "title": title_of(label), "balance": balance, "chart": chart}
     live.kept[f"law {label}"] = ((mark, id(analysis.current)), found)
-    return found
+    return _as_wide(found, query)
+
+
+def _as_wide(found: Mapping[str, Any], query: Query, key: str = "width") -> dict[str, Any]:
+    """What was found, with its chart as wide as this page draws it."""
+    return {**found, "chart": replace(found["chart"], width=width_of(query, key)).as_json()}
 
 
 def _shape(live: Live, query: Query) -> dict[str, Any]:
@@ -215,6 +225,7 @@ def _as_such(live: Live, query: Query) -> list[dict[str, Any]]:
             axis_label(measured.axis, measured.title, measured.unit),
             torque_label(f"{quantity}, {measured.balance} balance", measured.residual_unit),
             tuple(curves),
+            width=width_of(query),
         )
         out.append({"title": title, "balance": measured.balance, "chart": chart.as_json()})
 
@@ -347,7 +358,7 @@ def _against(live: Live, query: Query) -> dict[str, Any]:
         _label(first, y),
         tuple(curves),
         zero=False,
-        width=_width(query),
+        width=width_of(query),
         height=300,
     )
     return {"chart": chart.as_json(), "legend": legend}

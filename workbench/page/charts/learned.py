@@ -14,6 +14,7 @@ from identification.balance.balances import balances_of
 from identification.diagnosis.places import AXIS_TITLES, Axis, Place, Rows, place
 from identification.fitting.engine import stack
 from workbench.page.analysis import Analysis
+from workbench.show.chart import Chart
 from workbench.show.pictures import place_chart
 from workbench.show.plots import explained
 
@@ -30,10 +31,10 @@ def shown_residual(
 
 def curve_chart(
     analysis: Analysis, story: Mapping[str, Any], claim: Mapping[str, Any]
-) -> dict[str, Any]:
+) -> tuple[Chart, bool]:
     """The residual of the model as it stands over the variable of a learned curve, and what the
     learned curves of its balance take off it together: beside one another they share the work, and
-    only their sum can be told.
+    only their sum can be told. With it whether that is drawn.
     """
     balance, axis = str(claim["balance"]), str(claim["curve"]["axis"])
     now = analysis.current
@@ -49,7 +50,7 @@ def curve_chart(
     first = place(rows, before, balance, axis)
     law = explained(first, place(rows, after, balance, axis, like=first))
     shown = law if law is not None and _helps(first, law) else None
-    return place_chart(first, law=shown).as_json() | {"law": shown is not None}
+    return place_chart(first, law=shown), shown is not None
 
 
 def _helps(residual: Place, law: Place) -> bool:

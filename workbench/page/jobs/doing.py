@@ -101,13 +101,14 @@ def improve(place: Place, body: Body, progress: Progress) -> Change:
     return partial(_improved, steps, analysis.note, story)
 
 
-def export(place: Place, kind: str, progress: Progress) -> Change:
-    """The report, or an FMU, as a file to take home."""
+def export(place: Place, kind: str, body: Body, progress: Progress) -> Change:
+    """The report, with its ``author`` and ``notes``, or an FMU, as a file to take home."""
     steps = _settled(place, progress)
     if not steps:
         raise InputError("nothing to take home yet: fit first")
     if kind == "report":
-        app_export.report(place, steps, folder_of(place), progress)
+        author, notes = (str(body.get(k, "")).strip() for k in ("author", "notes"))
+        app_export.report(place, steps, progress, author=author, notes=notes)
     else:
         app_export.fmu(place, folder_of(place), progress, kind)
     return partial(_with_steps, steps)
@@ -168,9 +169,9 @@ ACTIONS: Final[Mapping[str, Callable[[Place, Body, Progress], Change]]] = {
     "replay": replay,
     "follow": follow,
     "plan": plan,
-    "report": lambda place, body, progress: export(place, "report", progress),
-    "plant": lambda place, body, progress: export(place, "plant", progress),
-    "estimator": lambda place, body, progress: export(place, "estimator", progress),
+    "report": lambda place, body, progress: export(place, "report", body, progress),
+    "plant": lambda place, body, progress: export(place, "plant", body, progress),
+    "estimator": lambda place, body, progress: export(place, "estimator", body, progress),
     "settle": settle,
     "prepare": prepare,
 }
