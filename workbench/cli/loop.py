@@ -77,7 +77,8 @@ def trusted(found: Improvement) -> Trust | None:
     """Which number of the last step to trust; None where nothing was fitted."""
     if not found.steps:
         return None
-    return trust(found.steps[-1].solution, found.data, profiles=False)
+    last = found.steps[-1].solution
+    return trust(last, found.data, profiles=False, left=found.final_ratios)
 
 
 def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
