@@ -58,8 +58,7 @@ def run_export(arguments: Namespace) -> int:
             f"whose model is an FMU: {', '.join(OF_FMU[:-1])} or {OF_FMU[-1]} "
             "(docs/user-fmu.md)."
         )
-        made.print_help()
-        return 0
+        made.parse_args(rest)  # prints it and ends
     return int(main([kind or "plant", *rest], prog="irj export"))
 
 
