@@ -32,8 +32,8 @@ def standing_of(
     data : Dataset
         The records of the fit.
     left : mapping of str to BalanceError, optional
-        What the verdict on the model looked at; the training records by default. A balance without
-        a noise floor has no ratio and is left out.
+        What is left of the training records, as the verdict counts it; by default as a fit does.
+        A balance without a noise floor has no ratio and is left out.
     """
     if left is None:
         left = assess(solution.model, data, data.train, solution.values).balances

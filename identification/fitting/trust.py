@@ -241,8 +241,8 @@ def trust(
     profiles : bool
         Intervals of shapes from refits on either side; without, from standard errors.
     left : mapping of str to BalanceError, optional
-        What the verdict on the model looked at; the training records by default. A value that
-        rests on a balance over `RATIO_LIMIT` is none to trust.
+        What is left of the training records, as the verdict counts it; by default as a fit does.
+        A value that rests on a balance over `RATIO_LIMIT` is none to trust.
     """
     if set(solution.free) <= set(solution.at_bound):  # all is known: no value was found here
         return Trust(())

@@ -78,8 +78,8 @@ def trusted(found: Improvement) -> Trust | None:
     """Which number of the last step to trust; None where nothing was fitted."""
     if not found.steps:
         return None
-    last = found.steps[-1].solution
-    return trust(last, found.data, profiles=False, left=found.final_ratios)
+    last = found.steps[-1]
+    return trust(last.solution, found.data, profiles=False, left=last.train.balances)
 
 
 def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
