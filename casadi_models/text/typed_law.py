@@ -637,8 +637,11 @@ def _effect_of(law: TypedLaw) -> Effect:
             "most 40"
         )
     places = _places(law.places)
+    try:
+        tree = parse(law.text)
+    except LawError as error:
+        raise LawError(f"the text is no law: {error}") from None
     parameters = _declared(law.parameters)
-    tree = parse(law.text)
     _known_names(tree, places, parameters)
     _checked_units(tree, law, places, parameters)
     own = tuple((n, f"{law.key}_{n}") for n in parameters)

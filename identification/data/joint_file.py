@@ -15,6 +15,7 @@ from casadi_models import JointModel, hold
 from casadi_models.term import INERTIAS
 from casadi_models.text.typed_law import TypedLaw
 from identification.data.joint_schema import (
+    BALANCES,
     CALIBRATION,
     CORRELATION,
     FITTED,
@@ -36,13 +37,15 @@ LARGEST_RATIO: Final = 1e75
 LARGEST_VALUE: Final = 1e75
 """Of a parameter: times a signal that is as large, and squared, it is still a number."""
 _TABLES: Final = (
-    *("joint", "known", "columns", "fitted", "correlation", "calibration", "provenance"),
-    *(TABLE, LAWS),
+    *("joint", "known", "columns", "fitted", "correlation", "balances"),
+    *("calibration", "provenance", TABLE, LAWS),
 )
 DECIMALS: Final = 9
 """Of a correlation in a file: two parameters that are told apart at all
 (:data:`identification.fitting.engine.COLLINEAR`) stay so, and a file of twenty parameters holds
 3 kB of them."""
+ERROR_DIGITS: Final = 6
+"""Of a standard error in a file."""
 
 
 @final
@@ -66,18 +69,30 @@ class Correlation:
         Parameters; others are independent of all.
     triangle : tuple of tuple of float
         Row k: correlations of parameter k + 1 with those before it.
+    errors : tuple of float
+        Of each parameter if the noise were white: with the correlations these are one covariance.
+        Stated errors come from windows of time, each by itself, and are another one's. Empty in a
+        file of an earlier version.
     """
 
     names: tuple[str, ...] = ()
     triangle: tuple[tuple[float, ...], ...] = ()
+    errors: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, names: Sequence[str], matrix: npt.NDArray[np.float64]) -> Correlation:
-        """From a matrix (p, p), whose diagonal is not looked at, as a file holds it."""
+    def of(
+        cls,
+        names: Sequence[str],
+        matrix: npt.NDArray[np.float64],
+        errors: npt.NDArray[np.float64],
+    ) -> Correlation:
+        """From a matrix (p, p), whose diagonal is not looked at, and the errors that belong to it,
+        as a file holds them."""
         rows = np.round(np.clip(matrix, -1.0, 1.0), DECIMALS).tolist()
         # a correlation of less than a file holds has no sign
         triangle = tuple(tuple(x + 0.0 for x in rows[k][:k]) for k in range(1, len(names)))
-        return cls(tuple(names), triangle)
+        told = tuple(float(f"{x:.{ERROR_DIGITS}g}") for x in errors.tolist())
+        return cls(tuple(names), triangle, told)
 
     @classmethod
     def read(cls, table: Mapping[str, Any], fitted: Collection[str], source: str) -> Correlation:
@@ -110,7 +125,35 @@ class Correlation:
             raise InputError(
                 f"{where}: {wrong:g} is no correlation; take the table out or fit again"
             )
-        return cls(names, found)
+        errors = given["errors"] or []
+        if not isinstance(errors, list) or len(errors) not in (0, len(names)):
+            raise InputError(
+                f"{where}: errors must be {len(names)} numbers, one for each of the parameters; "
+                "take the table out or fit again"
+            )
+        sizes = tuple(finite(x, f"{where} errors") for x in errors)
+        if any(x <= 0 for x in sizes):
+            raise InputError(
+                f"{where}: {min(sizes):g} is no standard error; take the table out or fit again"
+            )
+        return cls(names, found, sizes)
+
+    def moves(self, name: str, partner: str, error: float, stated: Mapping[str, float]) -> float:
+        """Where one parameter goes up by so much, how far another one goes in a fit that holds it.
+
+        Parameters
+        ----------
+        name, partner : str
+        error : float
+            Change of the first.
+        stated : mapping of str to float
+            Standard errors for a file that has none of its own beside the correlations.
+        """
+        rho = float(self.matrix([name, partner])[0, 1])
+        sizes = dict(zip(self.names, self.errors, strict=True)) if self.errors else stated
+        if name not in sizes or partner not in sizes:
+            return 0.0
+        return rho * sizes[partner] * error / sizes[name]
 
     def lines(self) -> list[str]:
         """The table of a joint file; nothing where fewer than two parameters are told."""
@@ -118,7 +161,8 @@ class Correlation:
             return []
         rows = [f"    {toml_value(row)}," for row in self.triangle]
         head = CORRELATION["parameters"].text(self.names)
-        return ["[correlation]", head, "triangle = [", *rows, "]"]
+        sizes = [CORRELATION["errors"].text(self.errors)] if self.errors else []
+        return ["[correlation]", head, *sizes, "triangle = [", *rows, "]"]
 
     def matrix(self, names: Sequence[str]) -> npt.NDArray[np.float64]:
         """Correlations of some parameters, (p, p): 1 on the diagonal, 0 for what is not told."""
@@ -129,6 +173,48 @@ class Correlation:
                 if a in own and b in own:
                     low, high = sorted((own[a], own[b]))
                     out[i, j] = out[j, i] = self.triangle[high - 1][low]
+        return out
+
+
+@final
+@dataclass(frozen=True)
+class Standing:
+    """What a fit left of one balance.
+
+    Attributes
+    ----------
+    ratio : float
+        Over its noise floor.
+    parameters : tuple of str
+        Those whose values rest on its rows.
+    """
+
+    ratio: float
+    parameters: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, table: Mapping[str, Any], source: str) -> dict[str, Standing]:
+        """From the table of a joint file, by balance.
+
+        Raises
+        ------
+        InputError
+            A balance without its ratio, or with one below zero.
+        """
+        out = {}
+        for balance, entry in table.items():
+            where = f"{source}: [balances] {balance}"
+            if not isinstance(entry, Mapping) or "ratio" not in entry:
+                raise InputError(
+                    f"{where} must be a table with ratio, as {balance} = {{ ratio = 1.0 }}"
+                )
+            given = BALANCES.read(entry, where)
+            if given["ratio"] < 0:
+                raise InputError(
+                    f"{where}: ratio = {given['ratio']:g} is below zero; take the table out or "
+                    "fit again"
+                )
+            out[balance] = cls(given["ratio"], given["parameters"])
         return out
 
 
@@ -153,6 +239,8 @@ class Joint:
         Standard errors of fitted values, where the file has them.
     correlation : Correlation
         How these go together; empty where the file does not say.
+    standing : mapping of str to Standing
+        What the fit that wrote the file left of each balance; empty where the file does not say.
     columns : mapping or None
         Column map of the record files.
     orders : tuple of float
@@ -184,6 +272,7 @@ class Joint:
     sample_time: float | None = None
     laws: Mapping[str, TypedLaw] = field(default_factory=dict)
     correlation: Correlation = Correlation()
+    standing: Mapping[str, Standing] = field(default_factory=dict)
 
     @property
     def turns_per_unit(self) -> float:
@@ -315,6 +404,7 @@ def parse_joint(data: Mapping[str, Any], source: str = "joint") -> Joint:
         errors={k: v["stderr"] for k, v in fitted.items() if v["stderr"] is not None},
         laws=read_laws(data.get(LAWS, {}), kind, source),
         correlation=Correlation.read(data.get("correlation", {}), fitted, source),
+        standing=Standing.read(data.get("balances", {}), source),
     )
     load_remembered(data.get(TABLE, {}), source)
     model = joint.model()
@@ -495,12 +585,14 @@ def toml_text(
     outside: Sequence[str] = (),
     *,
     correlation: Correlation | None = None,
+    standing: Mapping[str, Standing] | None = None,
 ) -> str:
     """The joint as the text of a joint file, with fitted values, standard errors, what the sensors
     were off by, and provenance.
 
     The calibration is a note: another record has its own. Labels of effects `outside` of a user's
-    FMU have their files remembered too. The correlation is that of the standard errors.
+    FMU have their files remembered too. The correlation is that of the standard errors, the
+    standing that of the balances.
     """
     head = {
         "name": joint.name,
@@ -527,6 +619,9 @@ def toml_text(
         lines += ["", "[fitted]", *_entries(FITTED, parameters)]
     if parameters and correlation is not None and (told := correlation.lines()):
         lines += ["", *told]
+    if parameters and standing:
+        left = {b: {"ratio": s.ratio, "parameters": s.parameters} for b, s in standing.items()}
+        lines += ["", "[balances]", *_entries(BALANCES, left)]
     if calibration:
         lines += ["", "[calibration]", *_entries(CALIBRATION, calibration)]
     origin = {"sample_time": joint.sample_time, **(provenance or {})}

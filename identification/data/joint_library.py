@@ -13,11 +13,14 @@ from typing import Any, Final, final
 from casadi_models.term import MOTOR_INERTIA
 from identification.data.joint_file import Joint, load_joint, parse_joint
 from identification.data.plain_text import from_json, from_toml
+from identification.data.schema import meant
 from identification.errors import InputError
 
 PUBLISHED: Final = (
     "M. Duclusaud et al., ICRA 2025, arXiv 2410.08650 (github.com/Rhoban/bam, Apache-2.0)"
 )
+TABLE: Final = "params.json"
+"""Their table, as it is published."""
 LAW_OF: Final = MappingProxyType(
     {
         "friction_viscous": ("viscous@motor", "motor_viscous"),
@@ -102,7 +105,7 @@ def entries(paths: Sequence[str | Path]) -> list[Entry]:
     ----------
     paths : sequence of str or Path
         ``.toml``: a joint file; ``.json``: a table of published parameters; a folder: all joint
-        files in it.
+        files in it, and the table of published parameters.
 
     Raises
     ------
@@ -112,10 +115,11 @@ def entries(paths: Sequence[str | Path]) -> list[Entry]:
     out: list[Entry] = []
     for path in map(Path, paths):
         if path.is_dir():
-            found = sorted(path.glob("*.toml"))
-            if not found:
-                raise InputError(f"{path}: no joint file (.toml) in this folder")
+            found, table = sorted(path.glob("*.toml")), path / TABLE
+            if not found and not table.is_file():
+                raise InputError(f"{path}: no joint file (.toml) and no {TABLE} in this folder")
             out += [_of_file(p) for p in found]
+            out += published(table) if table.is_file() else []
         elif path.suffix == ".json":
             out += published(path)
         else:
@@ -140,6 +144,7 @@ def chosen(names: Sequence[str], among: Sequence[Entry]) -> list[Entry]:
             raise InputError(
                 f"no joint {name!r} in the library; `irj joints list` has "
                 f"{', '.join(e.name for e in among[:8])}{', ...' if len(among) > 8 else ''}"
+                f"{meant(name, (e.name for e in among))}"
             )
         out += [e for e in found if e not in out]
     return out

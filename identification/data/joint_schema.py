@@ -179,12 +179,38 @@ CORRELATION: Final = Schema(
     (
         Key("parameters", "names", "parameters of [fitted]", required=True),
         Key(
+            "errors",
+            "any",
+            "their standard errors if the noise were white, which with the correlations say how "
+            "far one moves where another does",
+            form="list of numbers",
+            unit="SI",
+            absent="those of [fitted]",
+        ),
+        Key(
             "triangle",
             "any",
             "correlations, between -1 and 1",
             form="list of lists of numbers",
             required=True,
         ),
+    ),
+)
+
+BALANCES: Final = Schema(
+    "[balances] BALANCE",
+    "Written by a fit: how much it left of each balance. Values that rest on a balance far over "
+    "its noise floor may make up for a law that the model lacks; `irj trust` says so.",
+    (
+        Key(
+            "ratio",
+            "number",
+            "what is left over the noise floor; 1 is noise alone",
+            unit="1",
+            required=True,
+            digits=4,
+        ),
+        Key("parameters", "names", "parameters of [fitted] that rest on it", default=()),
     ),
 )
 
@@ -224,12 +250,14 @@ PAGES: Final = (
     OWN_EFFECTS,
     FITTED,
     CORRELATION,
+    BALANCES,
     CALIBRATION,
     PROVENANCE,
 )
 """The tables in the order of the reference page."""
 
 __all__ = [
+    "BALANCES",
     "CALIBRATION",
     "COLUMN",
     "CORRELATION",

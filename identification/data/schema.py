@@ -92,7 +92,7 @@ class Key:
         if value not in self.choices:
             raise InputError(
                 f"{where}: {self.name} = {value!r} is not known; use one of "
-                f"{', '.join(self.choices)}"
+                f"{', '.join(self.choices)}{meant(str(value), self.choices)}"
             )
         return str(value)
 

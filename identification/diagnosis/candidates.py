@@ -232,11 +232,18 @@ def _shown(place: str) -> str:
     }[place]
 
 
+BY_PARTS: Final = "are tried one by one"
+"""End of the reason of an effect that stands for several: no run shows it, and none is needed."""
+
+
+def shown_by_parts(why: str) -> bool:
+    """Whether an effect is not testable for its parts, which are candidates themselves."""
+    return why.endswith(BY_PARTS)
+
+
 def _why_not(effect: Effect, model: JointModel, data: Dataset) -> str:
     if effect.parts and (model.is_elastic or any(model.has(n) for n in effect.parts)):
-        return (
-            f"its parts ({', '.join(EFFECTS[n].title for n in effect.parts)}) are tried one by one"
-        )
+        return f"its parts ({', '.join(EFFECTS[n].title for n in effect.parts)}) {BY_PARTS}"
     if effect.warms and not data.sensing.has_temperature and _shortest(data) < WARM_UP:
         return (
             f"no temperature channel that changes, and a run shorter than {WARM_UP:g} s; "

@@ -162,7 +162,8 @@ class Improvement:
         """The joint with all that was added, learned curves that lower the error of held-out
         records included, as the text of a joint file.
         """
-        return joint_text(self.joint, self.stairs[-1].solution, self.data)
+        last = self.stairs[-1]
+        return joint_text(self.joint, last.solution, self.data, last.train.balances)
 
     @property
     def stairs(self) -> tuple[Step, ...]:

@@ -10,6 +10,7 @@ from typing import Any, Final, final
 from casadi_models import EFFECTS
 from identification.balance.kinematic import residual_unit
 from identification.data.formats import number, words
+from identification.data.schema import meant
 from identification.diagnosis.candidates import NotTestable
 from identification.diagnosis.claims import GAIN, Claim, Ranking, usual_drop
 from identification.diagnosis.trials import Trial, enough_blocks
@@ -153,7 +154,9 @@ def known_key(key: str) -> str:
     """
     wanted = key_of(key)
     if wanted not in EFFECTS:
-        raise InputError(f"unknown effect {key!r}; `irj effects` lists the library")
+        raise InputError(
+            f"unknown effect {key!r}; `irj effects` lists the library{meant(wanted, EFFECTS)}"
+        )
     return wanted
 
 

@@ -416,7 +416,9 @@ class Session:
         if left is not None:
             title = left.candidate.effect.title
             stopped = (
-                f"Stopped at the limit of additions ({len(standing.claims)}): {title} "
+                f"One effect is added at a time: {title} would be the next (irj improve goes on)."
+                if lean  # nobody has set a limit
+                else f"Stopped at the limit of additions ({len(standing.claims)}): {title} "
                 "would be the next."
             )
         if standing.claims:

@@ -40,6 +40,7 @@ from identification.balance.stacked import (
     sure_levels,
     taking_part,
 )
+from identification.balance.weak import INDEPENDENT_SHARE
 from identification.data.joint_file import Correlation
 from identification.errors import InputError
 from identification.fitting.covariance import correlations
@@ -99,6 +100,8 @@ class Solution:
         Of all that have a standard error, nuisances and what belongs to one run left out.
     noise_off : bool
         Whether what noise adds to the products of the columns was taken off them.
+    met : frozenset of str
+        Balances whose columns were met by those of the other sensors, which have other noise.
     """
 
     model: JointModel
@@ -113,6 +116,7 @@ class Solution:
     iterations: int = 0
     together: Correlation = Correlation()
     noise_off: bool = False
+    met: frozenset[str] = frozenset()
 
     @property
     def law(self) -> Law:
@@ -663,7 +667,10 @@ def _with_errors(
             apart = {*smoothing, HOLD_NAME, *balances.model.calibration}
             told = [k for k, i in enumerate(index.tolist()) if bare([free[i]])[0] not in apart]
             names = [free[index[k]] for k in told]
-            together = Correlation.of(names, corr[np.ix_(told, told)])
+            alone = spread / np.sqrt(np.maximum(np.diag(part.gram), 1e-300)) / norms[index]
+            together = Correlation.of(
+                names, corr[np.ix_(told, told)], alone[told] / math.sqrt(INDEPENDENT_SHARE)
+            )
     kept = dict(values)
     model = balances.model
     for n in model.calibration:
@@ -682,4 +689,5 @@ def _with_errors(
         iterations=used,
         together=together,
         noise_off=without.instruments is None and bool(np.any(without.noise.whole[0])),
+        met=frozenset() if without.instruments is None else without.instruments.met,
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from identification.balance.balances import balances_of
 from identification.balance.calibration import bare, names_of_runs, settled
 from identification.balance.dataset import Dataset
 from identification.balance.weak import INDEPENDENT_SHARE
-from identification.fitting.covariance import RANK
+from identification.fitting.covariance import RANK, inverse
 from identification.fitting.engine import Solution
 from identification.fitting.errors_in_variables.products import known, level_error, noise_products
 from identification.fitting.weak_form import WeakForm
@@ -55,6 +56,37 @@ def eliminated(gram: FloatArray, count: int) -> FloatArray:
         return gram
     inside = across @ np.linalg.pinv(own, rcond=RANK, hermitian=True) @ across.T
     return np.asarray(gram[:count, :count] - inside)
+
+
+RESTS: Final = 0.1
+"""Share of a parameter's variance that comes from the rows of a balance from which on its value
+rests on them: what a law that the model lacks leaves in these rows moves the value. Shares are
+nearly all over 0.5 or under 0.02."""
+
+
+def resting(solution: Solution, data: Dataset) -> dict[str, tuple[str, ...]]:
+    """Free parameters whose values rest on each balance.
+
+    Parameters
+    ----------
+    solution : Solution
+    data : Dataset
+        The records of the fit.
+    """
+    moving = tuple(n for n in solution.free if n not in solution.at_bound)
+    if not moving:
+        return {}
+    form = form_of(solution, data, moving, solution.weights)
+    stacked = form.stacked(np.array([form.values[n] for n in form.free]))
+    rows = {b: j * solution.weights[b][:, None] for b, j in stacked.jacobian.items()}
+    inside = np.array([x.T @ x for x in rows.values()])
+    back = inverse(inside.sum(axis=0))
+    variance = np.einsum("ij,bjk,ki->bi", back, inside, back)
+    share = variance / np.maximum(variance.sum(axis=0), 1e-300)
+    return {
+        b: tuple(n for k, n in enumerate(moving) if own[k] > RESTS)
+        for b, own in zip(rows, share, strict=True)
+    }
 
 
 def information(form: WeakForm, count: int, *, measured: bool = False) -> FloatArray:

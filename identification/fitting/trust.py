@@ -16,14 +16,18 @@ from casadi_models.parameter import Parameter
 from identification.balance.balances import balances_of
 from identification.balance.calibration import bare
 from identification.balance.dataset import HOLD_NAME, Dataset
-from identification.balance.stacked import references
+from identification.balance.stacked import references, taking_part
 from identification.balance.weak import INDEPENDENT_SHARE
-from identification.data.formats import words
-from identification.data.joint_file import Joint
+from identification.data.formats import number, words
+from identification.data.joint_file import Correlation, Joint, Standing
 from identification.errors import InputError
+from identification.fitting.assess import RATIO_LIMIT, BalanceError
 from identification.fitting.covariance import NORMAL, correlations
 from identification.fitting.engine import Solution
+from identification.fitting.errors_in_variables.instruments import instruments_of
+from identification.fitting.errors_in_variables.products import noise_products
 from identification.fitting.information import eliminated, form_of, white_errors
+from identification.fitting.joint_text import standing_of
 from identification.fitting.start_values import bounds_of
 from identification.fitting.weak_form import WeakForm
 
@@ -36,6 +40,9 @@ TIED: Final = 0.8
 variance."""
 WORTH_SAYING: Final = 0.5
 """Correlation from which a partner is named at all: a quarter of the variance."""
+APART: Final = 3.0
+"""Standard errors of their difference from which the value of one record is another one than that
+of all: one in 370 by chance, and a fit of ten parameters to two records has twenty."""
 WINDOWS: Final = 4
 """Windows of equal time over all training rows."""
 PROFILE_STEPS: Final = 4
@@ -49,6 +56,11 @@ DIGITS: Final = 5
 """Of a printed value at least: more than any wide interval needs."""
 MOST_DIGITS: Final = 12
 """The same at most: beyond them stands rounding."""
+MARKS: Final = {
+    "*": "outside the interval, within the error of that record alone",
+    "!": "another value than that of all records, by more than noise explains",
+}
+"""What stands behind the value of a record outside the interval, and what it means."""
 CLASSES: Final = ("inertia", "stiffness", "friction", "shape", "other")
 
 
@@ -68,6 +80,9 @@ class Trusted:
         95 % interval, from that error; for shapes from a profile.
     records, windows : tuple of (float or None)
         Value on each training record and in each of `WINDOWS` windows, where these tell it.
+    apart : tuple of int
+        Numbers of the records, from 0, whose value differs from that of all by more than noise
+        explains.
     partner : str or None
         The parameter it trades with.
     trade : str
@@ -93,6 +108,35 @@ class Trusted:
     prediction_percent: float | None
     verdict: str
     why: str
+    apart: tuple[int, ...] = ()
+
+    @property
+    def outside(self) -> tuple[int, ...]:
+        """Numbers of the records whose value lies outside the interval."""
+        if self.low is None or self.high is None:
+            return ()
+        low, high = self.low, self.high
+        return tuple(
+            k for k, v in enumerate(self.records) if v is not None and not low <= v <= high
+        )
+
+    def mark(self, record: int) -> str:
+        """What stands behind the value of a record: a key of :data:`MARKS`, or nothing."""
+        return "!" if record in self.apart else "*" if record in self.outside else ""
+
+    @property
+    def parts(self) -> str:
+        """Value by record and by window and the effect on the prediction, in a line; empty where
+        the records are not there. A value outside the interval has one of `MARKS`.
+        """
+        if not self.records:
+            return ""
+        told = [_value(v, self.digits) + self.mark(k) for k, v in enumerate(self.records)]
+        windows = [_value(v, self.digits) for v in self.windows]
+        moves = self.prediction_percent
+        return f"by record {', '.join(told)}; by window {', '.join(windows)}" + (
+            f"; moves the prediction by {moves:.2g} %" if moves is not None else ""
+        )
 
     @property
     def digits(self) -> int:
@@ -120,6 +164,7 @@ class Trusted:
             "prediction_percent": self.prediction_percent,
             "verdict": self.verdict,
             "why": self.why,
+            "records_apart": list(self.apart),
         }
 
 
@@ -152,9 +197,15 @@ class Trust:
                 f"{p.name:<28} {p.value:.{n}g} {p.unit} ({band}): {p.verdict}"
                 + (f"; {p.why}" if p.why else "")
             )
-            if p.trade:
-                lines.append(f"    {p.trade}")
+            lines += [f"    {text}" for text in (p.parts, p.trade) if text]
+        lines += [f"{mark} {said}" for mark, said in self.marks.items()]
         return "\n".join(lines)
+
+    @property
+    def marks(self) -> dict[str, str]:
+        """Those of `MARKS` that a value by record has."""
+        used = {p.mark(k) for p in self.parameters for k in range(len(p.records))}
+        return {mark: said for mark, said in MARKS.items() if mark in used}
 
     def __repr__(self) -> str:
         trusted = sum(p.verdict == "trust" for p in self.parameters)
@@ -173,7 +224,13 @@ def kind_of(model: JointModel, parameter: Parameter) -> str:
     return "friction" if friction else "other"
 
 
-def trust(solution: Solution, data: Dataset, *, profiles: bool = True) -> Trust:
+def trust(
+    solution: Solution,
+    data: Dataset,
+    *,
+    profiles: bool = True,
+    left: Mapping[str, BalanceError] | None = None,
+) -> Trust:
     """Judge every free parameter of a fit.
 
     Parameters
@@ -183,10 +240,14 @@ def trust(solution: Solution, data: Dataset, *, profiles: bool = True) -> Trust:
         The records of the fit.
     profiles : bool
         Intervals of shapes from refits on either side; without, from standard errors.
+    left : mapping of str to BalanceError, optional
+        What is left of the training records, as the verdict counts it; by default as a fit does.
+        A value that rests on a balance over `RATIO_LIMIT` is none to trust.
     """
     if set(solution.free) <= set(solution.at_bound):  # all is known: no value was found here
         return Trust(())
-    return _Judge(solution, data).all(profiles=profiles)
+    found = _Judge(solution, data).all(profiles=profiles)
+    return _doubted(found, standing_of(solution, data, left))
 
 
 @final
@@ -217,9 +278,23 @@ class _Judge:
             np.linalg.norm(np.concatenate(list(references(data, data.train).values())))
         )
         count = len(self.moving)
-        self.gram = eliminated(self.j.T @ self.j, count)
+        self.noise, self.by = None, self.j
+        if solution.noise_off or solution.met:
+            self.noise = noise_products(self.form, solution.met)
+        if solution.met:
+            beside = instruments_of(self.form, solution.met)
+            own = np.concatenate([stacked.jacobian[b] * weights[b][:, None] for b in names])
+            self.by = turns.without(beside.beside(own, self.form))
+        power = {b: weights[b] ** 2 * taking_part(b, data.train) for b in names}
+        self.power = np.concatenate([p / max(float(p.sum()), 1e-300) for p in power.values()])
+        gram, self.step = self._step(np.ones(len(self.r), dtype=np.bool_))
+        self.gram = eliminated(gram, count)
         self.white = white_errors(self.gram)
-        self.together = correlations(self.gram)[1]
+        self.together = solution.together
+        if not self.together.names:  # too few windows for errors: the file says none of them either
+            spread = correlations(self.gram)[1]
+            sizes = np.where(np.isfinite(self.white), self.white, 0.0)
+            self.together = Correlation.of(self.moving, spread, sizes)
         self.nuisance = {*smoothing, HOLD_NAME, *self.model.calibration}
         self.limits = bounds_of(self.model, data.joint.known, data)
 
@@ -240,27 +315,65 @@ class _Judge:
         last = max(int(self.block.max(initial=0)) + 1, 1)
         return np.where(self.block >= 0, self.block * WINDOWS // last, -1)
 
-    def _on(self, rows: npt.NDArray[np.bool_]) -> dict[str, float | None]:
-        """Values that some of the rows alone give: one Gauss-Newton step; None where these do not
-        tell a parameter to `KNOWN`."""
-        j, r = self.j[rows], self.r[rows]
-        gram = j.T @ j
-        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        scaled = gram / np.outer(size, size)
-        step = -np.linalg.pinv(scaled, rcond=1e-9, hermitian=True) @ ((j.T @ r) / size) / size
+    def _on(self, rows: npt.NDArray[np.bool_]) -> dict[str, tuple[float, float] | None]:
+        """Values that some of the rows alone give, one Gauss-Newton step, and their errors if the
+        noise were white; None where these do not tell a parameter to `KNOWN`.
+
+        What is known beforehand of the sensors is in no row: a step of all rows is taken off.
+        """
+        gram, step = self._step(rows)
+        step = step - self.step
         errors = white_errors(eliminated(gram, len(self.moving)))
-        out: dict[str, float | None] = {}
+        out: dict[str, tuple[float, float] | None] = {}
         for k, n in enumerate(self.moving):
             value = self.solution.values[n]
             known = math.isfinite(errors[k]) and errors[k] < KNOWN * abs(value)
-            out[n] = value + float(step[k]) if known else None
+            out[n] = (value + float(step[k]), float(errors[k])) if known else None
         return out
+
+    def _step(self, rows: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix of some of the rows, and the step that they ask for."""
+        j, r = self.j[rows], self.r[rows]
+        gram, score = j.T @ j, j.T @ r
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        scaled = gram / np.outer(size, size)
+        if self.noise is not None:  # what noise adds to the products falls to rows by their weights
+            by = self.by[rows]
+            power = np.split(self.power * rows, len(self.noise.gram))
+            share = [float(x.sum()) for x in power]
+            parts = [*zip(share, self.noise.gram.values(), self.noise.score.values(), strict=True)]
+            score = by.T @ r - np.sum([s * x for s, _, x in parts], axis=0)
+            added = np.sum([s * g for s, g, _ in parts], axis=0)
+            seen = np.diag(gram) > 0  # no unknown of another run
+            score = np.where(seen, score, 0.0)
+            scaled = np.where(np.outer(seen, seen), by.T @ j - added, 0.0) / np.outer(size, size)
+        back = np.linalg.pinv(scaled, rcond=1e-9)
+        return gram, -back @ (score / size) / size
+
+    def _apart(
+        self, k: int, wider: float, by_record: Sequence[Mapping[str, tuple[float, float] | None]]
+    ) -> tuple[int, ...]:
+        """Records whose value is another one than that of all.
+
+        All rows hold those of the record: the variance of the difference is the record's less that
+        of all (Hausman 1978, Econometrica 46:1251), widened as the stated error is.
+        """
+        name, out = self.moving[k], []
+        for number_, found in enumerate(by_record):
+            told = found[name]
+            if told is None:
+                continue
+            value, own = told
+            size = wider * math.sqrt(max(own**2 - float(self.white[k]) ** 2, 0.0))
+            if len(by_record) > 1 and abs(value - self.solution.values[name]) > APART * size > 0:
+                out.append(number_)
+        return tuple(out)
 
     def _judged(
         self,
         p: Parameter,
-        by_record: Sequence[Mapping[str, float | None]],
-        by_window: Sequence[Mapping[str, float | None]],
+        by_record: Sequence[Mapping[str, tuple[float, float] | None]],
+        by_window: Sequence[Mapping[str, tuple[float, float] | None]],
         *,
         profiles: bool,
     ) -> Trusted:
@@ -287,8 +400,9 @@ class _Judge:
             stderr=error,
             low=low,
             high=high,
-            records=tuple(v[p.name] for v in by_record),
-            windows=tuple(v[p.name] for v in by_window),
+            records=tuple(told[0] if (told := v[p.name]) else None for v in by_record),
+            windows=tuple(told[0] if (told := v[p.name]) else None for v in by_window),
+            apart=self._apart(k, error / white, by_record),
             partner=partner,
             trade=self._trade(p.name, partner, error, rho) if partner else "",
             prediction_percent=self._prediction(k, NORMAL * error),
@@ -298,13 +412,14 @@ class _Judge:
 
     def _partner(self, k: int) -> tuple[str | None, float]:
         """The parameter with the largest correlation, and that correlation."""
-        seen = {n: i for i, n in enumerate(self.moving) if n not in self.nuisance and i != k}
-        return _partner_of({n: float(self.together[k, i]) for n, i in seen.items()})
+        own = self.moving[k]
+        names = [n for n in self.moving if n not in self.nuisance and n != own]
+        beside = self.together.matrix([own, *names])[0, 1:]
+        return _partner_of(dict(zip(names, beside.tolist(), strict=True)))
 
     def _trade(self, name: str, partner: str, error: float, rho: float) -> str:
         """One standard error up, and what its partner does then."""
-        i, k = self.moving.index(partner), self.moving.index(name)
-        moves = rho * float(self.white[i]) * error / float(self.white[k])
+        moves = self.together.moves(name, partner, error, {})
         values = self.solution.values
         return _traded((name, values[name], error), (partner, values[partner], moves), rho)
 
@@ -413,7 +528,7 @@ def trusted_file(joint: Joint) -> Trust:
         verdict, why = _by_error(share, rho, identified=True)
         trade = ""
         if partner is not None:
-            moves = rho * joint.errors.get(partner, 0.0)
+            moves = joint.correlation.moves(p.name, partner, error, joint.errors)
             trade = _traded((p.name, value, error), (partner, joint.fitted[partner], moves), rho)
         low, high = known[p.name].low, known[p.name].high
         out.append(
@@ -428,7 +543,27 @@ def trusted_file(joint: Joint) -> Trust:
                 why=why,
             )
         )
+    return _doubted(Trust(tuple(out)), joint.standing)
+
+
+def _doubted(found: Trust, standing: Mapping[str, Standing]) -> Trust:
+    """Values that rest on a balance far over its noise are none to trust, however narrow their
+    intervals: these are intervals of this model, and say nothing of the law that it lacks.
+    """
+    over = {b: s for b, s in standing.items() if s.ratio > RATIO_LIMIT}
+    out = []
+    for p in found.parameters:
+        sure = {b: number(s.ratio, 2) for b, s in over.items() if p.name in s.parameters}
+        on = [f"{b} balance ({ratio}" for b, ratio in sure.items()]
+        if on:
+            said = f"the model lacks a law in the {' and the '.join(on)} times its noise floor)"
+            p = replace(p, verdict="not", why=f"{p.why}; {said}" if p.why else said)
+        out.append(p)
     return Trust(tuple(out))
+
+
+def _value(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"
 
 
 def _partner_of(others: Mapping[str, float]) -> tuple[str | None, float]:
@@ -462,7 +597,7 @@ def _by_error(share: float, rho: float, *, identified: bool) -> tuple[str, str]:
     if not identified:
         return "only in combination", "not identifiable by itself"
     if share > KNOWN and abs(rho) >= TIED:
-        return "only in combination", "known to less than 10 % and tied to another"
+        return "only in combination", "known no better than to 10 % and tied to another"
     return "trust", ""
 
 

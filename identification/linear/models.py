@@ -65,6 +65,9 @@ ALIKE, PERCENT = 1.1, 0.05
 """A lower order is kept while it leaves at most this much more variance: factor, and percent
 points; as in the choice of a subspace model's order.
 """
+MORE_STATES: Final = 2
+"""Orders that a subspace model may have beyond those of a black box: its states serve all outputs.
+"""
 FIT_SAMPLES: Final = 20_000
 """Most samples used to fit."""
 BLOCK_ROWS: Final = 20
@@ -230,7 +233,7 @@ def linear_models(
     families : sequence of str
         Among :data:`FAMILIES`.
     max_order : int
-        Highest order tried, 1 to 12; FIR takes 5, 10 and 20.
+        Highest order tried, 1 to 12; FIR takes 5, 10 and 20, and MOESP `MORE_STATES` more.
     every : int, optional
         Keep every so manyth sample; by default five samples per period of the highest frequency
         that input and output share.
@@ -469,7 +472,9 @@ class _Bench:
         u, y = _lists(self._train)
         weights = tuple(float(w) for w in 1.0 / self._size)
         rows = min(BLOCK_ROWS, max(max(len(one) for one in u) // 8, 2))
-        options = MoespOptions(output_weights=weights, max_order=self._max_order + 2, noise=True)
+        options = MoespOptions(
+            output_weights=weights, max_order=self._max_order + MORE_STATES, noise=True
+        )
 
         def made(order: int | None) -> Subspace:
             with warnings.catch_warnings():

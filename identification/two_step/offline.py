@@ -7,6 +7,7 @@ derivatives by differences, the shapes searched over their boxes, the rest linea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,12 +15,14 @@ import numpy as np
 
 from casadi_models.term import LINK_INERTIA
 from identification.balance.sensing import drive_torque, sense
-from identification.data.joint_file import Joint
+from identification.data.joint_file import Joint, parse_joint, toml_text
+from identification.data.plain_text import from_toml
 from identification.data.prepare import THESIS_CUTOFF, filtered, trimmed, with_derivatives
 from identification.data.record import Record
 from identification.errors import InputError
 from identification.two_step.algorithm import JOINT_CHANNELS, TwoStep, TwoStepFit, from_joint
 from identification.two_step.varpro_search import Method
+from identification.version import VERSION
 
 PER_PERIOD: Final = 10.0
 """Samples kept per period of the filter's cut-off: those between are a line through them."""
@@ -91,3 +94,39 @@ def fit_records(
     assert signals.shape[1] == len(JOINT_CHANNELS)
     y = np.column_stack([drive, np.zeros(len(drive))]) if model.is_elastic else drive[:, None]
     return TwoStep(from_joint(model, signals), method).fit(y, signals)
+
+
+def two_step_text(found: TwoStepFit, records: Sequence[Record], joint: Joint) -> str:
+    """The joint with the values of a two-step fit, as the text of a joint file.
+
+    Parameters
+    ----------
+    found : TwoStepFit
+    records : sequence of Record
+    joint : Joint
+        Whose model was fitted.
+
+    Raises
+    ------
+    InputError
+        A value outside its physical bounds: no file could be read back.
+    """
+    fitted = {}
+    for p in joint.model().parameters:
+        if p.name in found.values:
+            error = found.deviation[p.name]
+            sure = math.isfinite(error) and error > 0  # nothing is known of a shape that is held
+            fitted[p.name] = {
+                "value": float(found.values[p.name]),
+                "stderr": float(error) if sure else None,
+                "unit": p.unit,
+                "side": p.side,
+            }
+    origin = {
+        "records": ", ".join(r.name for r in records),
+        "sample_time": min(r.dt for r in records),
+        "version": VERSION,
+    }
+    text = toml_text(joint, fitted, origin)
+    parse_joint(from_toml(text, joint.source or joint.name), joint.source or joint.name)
+    return text

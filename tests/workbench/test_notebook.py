@@ -157,6 +157,14 @@ def test_frames_hold_what_the_results_say(results: dict[str, Any]) -> None:
         frames(3)
 
 
+def test_a_comparison_stands_in_a_cell_as_a_document(results: dict[str, Any]) -> None:
+    """With every place, where the cell shows the first ones; names from files stay text."""
+    found = results["comparison"]
+    shown = interactive(found).document
+    assert shown.count('class="picture"') == len(found.places) > 4
+    assert "<script>alert" not in shown and "Worst window" in shown
+
+
 @needs_chromium
 def test_the_report_works_inside_a_cell(results: dict[str, Any]) -> None:
     """Its plots are drawn and zoom; names from files stay text; it cannot reach the notebook."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from identification import read
+from identification import load_joint, read
 from identification.data.prepare import butterworth
 from workbench.cli.main import main
 
@@ -62,6 +62,18 @@ def test_two_steps_give_back_the_friction_of_a_joint(method: str, place: Path) -
     assert torque(found) == pytest.approx(torque(true), rel=0.02)
     whole = [sum(v for n, v in p.items() if n.endswith("inertia")) for p in (found, true)]
     assert whole[0] == pytest.approx(whole[1], rel=0.02)
+
+
+def test_a_two_step_fit_becomes_a_joint_file(place: Path) -> None:
+    fitted, told = place / "fitted.toml", place / "told.json"
+    arguments = [str(place / "run.npz"), "--joint", str(place / "joint.toml"), "--json", str(told)]
+    assert main(["twostep", *arguments, "-o", str(fitted)]) == 0
+    found = json.loads(told.read_text())["parameters"]
+    joint = load_joint(fitted)
+    assert joint.fitted == pytest.approx({n: p["value"] for n, p in found.items()}, rel=1e-9)
+    assert joint.errors["motor_viscous"] == pytest.approx(found["motor_viscous"]["deviation"])
+    assert joint.sample_time == pytest.approx(4e-3)
+    assert main(["compare", str(place / "run.npz"), "--joint", str(fitted), "--no-linear"]) == 0
 
 
 def test_an_elastic_joint_needs_its_link_inertia(

@@ -56,7 +56,7 @@
     charts = [
       new uPlot(options(boxes[0], 260, [time(), curve("measured", "--ink", null, 2.2)].concat(start, [curve(last, "--after")]), entry.quantity + side + unit() + "]", drag),
         pick(torqueRows()), boxes[0]),
-      new uPlot(options(boxes[1], 220, [time()].concat(left, [curve("residual, " + last, "--after")]), "residual" + side + unit() + "]", drag),
+      new uPlot(options(boxes[1], 290, [time()].concat(left, [curve("residual, " + last, "--after")]), "residual" + side + unit() + "]", drag),
         pick(residualRows()), boxes[1]),
       new uPlot(options(boxes[2], 110, [time(), curve(report.added ? "residual, start model" : "residual", report.added ? "--before" : "--after", null, 1)],
         "", { legend: { show: false }, cursor: { drag: { x: true, y: false, setScale: false } },

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from identification.data.plain_text import from_toml
+from identification.data.schema import meant
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs, replace_files
 from workbench.cli.files import open_joint, write_json
@@ -28,7 +30,7 @@ def run_export(arguments: Namespace) -> int:
     """`irj export [KIND] --joint J`: FMUs by irj_fmu.build, `c` and `casadi` here; `plant`
     without a kind.
     """
-    from irj_fmu.build import KINDS, main
+    from irj_fmu.build import KINDS, main, parser
     from irj_fmu.imported.export import KINDS as OF_FMU
 
     every = (*KINDS, *CODE_KINDS, *OF_FMU)
@@ -45,10 +47,19 @@ def run_export(arguments: Namespace) -> int:
         )
     if kind is not None and kind not in KINDS:
         raise InputError(
-            f"export: {kind!r} cannot be built; choose one of {', '.join((*KINDS, *CODE_KINDS))}"
+            f"export: {kind!r} cannot be built; choose one of "
+            f"{', '.join((*KINDS, *CODE_KINDS))}"
+            f"{meant(kind, every) or '; plant is the joint as an FMU'}"
         )
-    asks = not kind and {"-h", "--help"} & set(rest)
-    return int(main(rest if asks else [kind or "plant", *rest], prog="irj export"))
+    if not kind and {"-h", "--help"} & set(rest):
+        made = parser("irj export")
+        made.epilog = (
+            f"Of a joint also {' and '.join(CODE_KINDS)}: its functions as code. Of a joint file "
+            f"whose model is an FMU: {', '.join(OF_FMU[:-1])} or {OF_FMU[-1]} "
+            "(docs/user-fmu.md)."
+        )
+        made.parse_args(rest)  # prints it and ends
+    return int(main([kind or "plant", *rest], prog="irj export"))
 
 
 def _kind(rest: list[str], known: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -130,7 +141,21 @@ def run_cosim(arguments: Namespace) -> int:
 
 def run_batch(arguments: Namespace) -> int:
     """`irj batch`."""
+    for word in arguments.rest[:1]:  # what follows may be a result
+        if word.endswith(".toml") and _is_joint(Path(word)):
+            raise InputError(f"{word}: is a joint file; a study has [study] (docs/batch.md)")
     return _passed("irj_fmu.batch.run", arguments)
+
+
+def _is_joint(path: Path) -> bool:
+    """Whether a file has what a joint has, and nothing of a study; one that cannot be read is
+    none.
+    """
+    try:
+        tables = from_toml(path.read_text(encoding="utf-8-sig"), str(path))
+    except (OSError, ValueError):
+        return False
+    return isinstance(tables.get("joint"), dict) and not {"study", "model"} & set(tables)
 
 
 def _passed(name: str, arguments: Namespace) -> int:

@@ -13,10 +13,25 @@ from workbench.cli.files import open_joint, open_records, progress_bar, write_js
 
 def run_joints(arguments: Namespace) -> int:
     """`irj joints list|show|compare`."""
-    among = [*packaged(), *entries(arguments.library)]
+    paths, names = _apart(arguments.library)
+    arguments.names = [*arguments.names, *names]
+    among = [*packaged(), *entries(paths)]
     work = {"list": _listed, "show": _shown, "compare": _compared}[arguments.what]
     work(arguments, among)
     return 0
+
+
+def _apart(given: list[list[str]]) -> tuple[list[str], list[str]]:
+    """Paths of libraries, and names of joints that were written behind one: the first word of each
+    `--library` is a path, and so are others that lie there.
+    """
+    paths: list[str] = []
+    names: list[str] = []
+    for first, *more in given:
+        paths.append(first)
+        for word in more:
+            (paths if Path(word).exists() else names).append(word)
+    return paths, names
 
 
 def _listed(arguments: Namespace, among: list[Entry]) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from casadi_models import EFFECTS
 from casadi_models.text.typed_law import LawError, TypedLaw, derived_key, register
 from identification.data.joint_file import Joint
+from identification.data.schema import meant
 from identification.errors import InputError
 from workbench.cli.files import enlarged, open_joint, write_json, write_text
 
@@ -15,7 +16,10 @@ from workbench.cli.files import enlarged, open_joint, write_json, write_text
 def run_effects(arguments: Namespace) -> int:
     """`irj effects [KEY]`."""
     if arguments.key is not None and arguments.key not in EFFECTS:
-        raise InputError(f"no effect {arguments.key!r} in the library; `irj effects` lists it")
+        raise InputError(
+            f"no effect {arguments.key!r} in the library; `irj effects` lists it"
+            f"{meant(arguments.key, EFFECTS)}"
+        )
     chosen = [EFFECTS[arguments.key]] if arguments.key is not None else list(EFFECTS.values())
     data = [
         {

@@ -16,6 +16,7 @@ from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.diagnosis.improve import Improvement, improve
 from identification.diagnosis.outcome import known_key
+from identification.errors import InputError
 from identification.fitting.engine import prepared_model
 from identification.fitting.fit import Fit, fit
 from identification.fitting.trust import Trust, trust
@@ -77,7 +78,8 @@ def trusted(found: Improvement) -> Trust | None:
     """Which number of the last step to trust; None where nothing was fitted."""
     if not found.steps:
         return None
-    return trust(found.steps[-1].solution, found.data, profiles=False)
+    last = found.steps[-1]
+    return trust(last.solution, found.data, profiles=False, left=last.train.balances)
 
 
 def print_warnings(warnings: Sequence[str], records: Sequence[Record]) -> None:
@@ -99,6 +101,10 @@ def training(
 
 def run_improve(arguments: Namespace) -> int:
     """`irj improve`."""
+    for option in ("author", "notes", "beside"):
+        if getattr(arguments, option) and not arguments.report:
+            raise InputError(f"improve: --{option} is for the report; give --report, too")
+    beside = results_beside(arguments.beside)
     data, found, records = improve_files(
         arguments.records,
         arguments.held_out,
@@ -113,7 +119,15 @@ def run_improve(arguments: Namespace) -> int:
         write_text(arguments.output, found.to_joint_file())
         print(", ".join(filter(None, (f"joint file: {arguments.output}", left_behind(found)))))
     write_picture(found, arguments.picture)
-    _write_report(found, records, arguments.report, arguments.command)
+    _write_report(
+        found,
+        records,
+        arguments.report,
+        arguments.command,
+        author=arguments.author or "",
+        notes=arguments.notes or "",
+        beside=beside,
+    )
     return 0
 
 
@@ -243,7 +257,7 @@ def run_fit(arguments: Namespace) -> int:
 
 def run_twostep(arguments: Namespace) -> int:
     """`irj twostep`."""
-    from identification.two_step.offline import fit_records
+    from identification.two_step.offline import fit_records, two_step_text
 
     joint = open_joint(arguments.joint)
     records, warnings = open_records(arguments.records, joint)
@@ -263,6 +277,8 @@ def run_twostep(arguments: Namespace) -> int:
         ]
         said = f" ({', '.join(notes)})" if notes else ""
         print(f"  {name:<28} {value:.6g} +- {found.deviation[name]:.2g} {units[name]}{said}")
+    if arguments.output:
+        write_text(arguments.output, two_step_text(found, records, joint))
     write_json(
         arguments.json,
         {

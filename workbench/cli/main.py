@@ -58,6 +58,15 @@ def _port(text: str) -> int:
     return value
 
 
+def _one_of(choices: tuple[str, ...], text: str) -> str:
+    """One of some words, with the one that may be meant where it is none."""
+    if text not in choices:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is none of {', '.join(choices)}{meant(text, choices)}"
+        )
+    return text
+
+
 @functools.cache
 def parser() -> OneLineParser:
     """Arguments of every verb; those of export, cosim and batch go through to their own."""
@@ -101,6 +110,23 @@ def parser() -> OneLineParser:
         )
         sub.add_argument(
             "--other-payload", nargs="+", action="extend", metavar="REC", default=[], help=text
+        )
+
+    def first_page(sub: argparse.ArgumentParser) -> None:
+        sub.add_argument(
+            "--beside",
+            nargs="+",
+            action="extend",
+            metavar="RESULT",
+            default=[],
+            help="for the report: results of `irj improve --json` of another date or joint, for a "
+            "comparison",
+        )
+        sub.add_argument("--author", metavar="NAME", help="for the first page of the report")
+        sub.add_argument(
+            "--notes",
+            metavar="TEXT",
+            help="for the first page of the report, as what was changed before",
         )
 
     demo = verb(
@@ -215,6 +241,7 @@ def parser() -> OneLineParser:
     separated.add_argument(
         "--cutoff", type=float, default=15.0, metavar="HZ", help="of the prefilter (default 15)"
     )
+    separated.add_argument("-o", "--output", metavar="FILE", help="write the fitted joint file")
     compared = verb(
         "compare",
         "loop",
@@ -275,6 +302,7 @@ def parser() -> OneLineParser:
         help="records the fit must not see",
     )
     improved.add_argument("--report", metavar="FILE", help="write the HTML report")
+    first_page(improved)
     improved.add_argument(
         "--picture", metavar="FILE.svg", help="draw the falling error and the place of the residual"
     )
@@ -341,18 +369,7 @@ def parser() -> OneLineParser:
     report.add_argument(
         "-o", "--output", metavar="FILE", default="irj-report.html", help="the HTML file"
     )
-    report.add_argument(
-        "--beside",
-        nargs="+",
-        action="extend",
-        metavar="RESULT",
-        default=[],
-        help="results of `irj improve --json` of another date or joint, for a comparison",
-    )
-    report.add_argument("--author", metavar="NAME", help="for the first page")
-    report.add_argument(
-        "--notes", metavar="TEXT", help="for the first page, as what was changed before"
-    )
+    first_page(report)
     listed = verb("effects", "library", "list the effect library, or one effect")
     listed.add_argument("key", nargs="?", help="key of one effect")
     added = verb("add", "library", "add an effect to a joint file")
@@ -587,7 +604,11 @@ def parser() -> OneLineParser:
         help="moesp fir arx arma armax ararx ararmax oe bj (default: all)",
     )
     plain.add_argument(
-        "--max-order", type=_count, default=6, metavar="N", help="highest order tried (default 6)"
+        "--max-order",
+        type=_count,
+        default=6,
+        metavar="N",
+        help="highest order tried (default 6; moesp, whose states serve all outputs, two more)",
     )
     plain.add_argument(
         "--every",
@@ -618,10 +639,11 @@ def parser() -> OneLineParser:
     joints.add_argument(
         "--library",
         nargs="+",
-        action="extend",
+        action="append",
         metavar="PATH",
         default=[],
-        help="more joints: joint files, folders of them, a table of published parameters (.json)",
+        help="more joints: joint files, folders of them, a table of published parameters (.json); "
+        "names may follow the path",
     )
     for name, text in (
         ("export", "export as FMU, C or CasADi function"),
@@ -652,6 +674,10 @@ def parser() -> OneLineParser:
             "-v", "--verbose", action="store_true", help="list what is not testable, and why"
         )
     with_examples(made)
+    for sub in made.verbs.values():
+        for action in sub.arguments:
+            if action.choices is not None and action.type is None:
+                action.type = functools.partial(_one_of, tuple(action.choices))
     return made
 
 

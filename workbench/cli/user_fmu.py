@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from identification.data.check.checks import Finding
 from identification.data.check.gate import gate_warnings
 from identification.data.record import Record
+from identification.data.schema import meant
 from identification.errors import InputError
 from irj_fmu.command_line import OneLineParser, check_output, keep_inputs
 from workbench.cli.files import distinct, open_records, progress_bar, write_json, write_text
@@ -425,6 +426,7 @@ def run_export(arguments: Namespace) -> int:
         raise InputError(
             f"export {given.kind}: the model of {given.joint} is an FMU, which goes out as "
             f"{', '.join(KINDS[:-1])} or {KINDS[-1]}; write one of them"
+            f"{meant(given.kind, KINDS)}"
         )
     if given.target is not None and given.kind != "corrected":
         raise InputError(f"--target: goes with corrected, not with {given.kind}; leave it out")

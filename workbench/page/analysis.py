@@ -540,7 +540,9 @@ class Analysis:
         kept = (
             self.joint if own <= set(now.model.effects) else replace(self.joint, model_name="hd1")
         )
-        return joint_text(kept, now, self.data)
+        seen = assess(now.model, self.data, self.data.train, now.values)
+        left = self.bench.judged(now, seen, held_out=False).balances
+        return joint_text(kept, now, self.data, left)
 
     # --- inside -----------------------------------------------------------------------------------
 

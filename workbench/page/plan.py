@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import numpy as np
 
 from casadi_models import EFFECTS, JointModel
+from identification.diagnosis.candidates import shown_by_parts
 from identification.errors import InputError
 from workbench.page.analysis import Progress, clean
 from workbench.page.jobs.place import Place
@@ -106,7 +107,7 @@ def open_questions(state: State, kind: str) -> list[dict[str, Any]]:
         {label.partition("@")[0] for label in state.steps[-1].effects} if state.steps else set()
     )
     for n in left.get("not_testable", []):
-        if n["effect"] in inside:
+        if n["effect"] in inside or shown_by_parts(n["why"]):
             continue
         out.append(
             {

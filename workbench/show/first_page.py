@@ -15,12 +15,20 @@ from casadi_models.text.written import written
 from identification.data.channels import channel_unit
 from identification.data.formats import number, pretty_unit, with_error
 from identification.data.record import Record
+from identification.diagnosis.candidates import shown_by_parts
 from identification.diagnosis.improve import Improvement
 from workbench.show.chart import Chart, Curve, Label, svg
 from workbench.show.pictures import AT_THE_LINK, AT_THE_MOTOR, place_picture
 from workbench.show.plots import ReportPlots, decimated, explained
 from workbench.show.results import staircase_html, step_names, table, text
-from workbench.show.words import OUTCOME_WORDS, kind_of, plain_name, run_that_shows, title_of
+from workbench.show.words import (
+    OUTCOME_WORDS,
+    kind_of,
+    name_in_formula,
+    plain_name,
+    run_that_shows,
+    title_of,
+)
 
 MOST_LAWS: Final = 4
 MOST_RUNS: Final = 3
@@ -28,6 +36,10 @@ MOST_RUNS: Final = 3
 MOTIONS: Final = 4
 """Records whose motion is drawn."""
 MOTION_POINTS: Final = 500
+_GUARD: Final = re.compile(r" \+ 1e-(?:06|12)\b|max\(([^,]*), 1e-12\)")
+"""Numbers of the laws that are there for the arithmetic alone."""
+_NAME: Final = re.compile(r"(?<![\w.])[A-Za-z_]\w*\b(?!\()")
+"""A symbol in a written expression: no function, no exponent of a number."""
 
 
 # --- the first page -------------------------------------------------------------------------------
@@ -98,7 +110,7 @@ def law_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     effort = "Forces" if improvement.joint.kind == "linear" else "Torques"
     more = f"; {len(rows) - MOST_LAWS} more in the details" if len(rows) > MOST_LAWS else ""
     caption = f"{effort} referred to the link, SI units{more}"
-    shown = table(head, rows[:MOST_LAWS], caption, wide=True)
+    shown = table(head, rows[:MOST_LAWS], caption, stacked=True)
     return f"<h2>The {word} in numbers</h2>{shown}{curves}"
 
 
@@ -132,10 +144,13 @@ def _with(symbol: Expression, definition: Expression) -> str:
 
 
 def _formula(part: Expression, sign: str = "") -> str:
-    """A formula for the eye, as HTML: powers as ^, products as a raised dot; lines end before a
-    product or a quotient, never inside a name or a number.
+    """A formula for the eye, as HTML: names as words, powers as ^, products as a raised dot; what
+    only keeps a root or a logarithm from zero is left out. Lines end before a product or a
+    quotient, never inside a name or a number.
     """
-    plain = written(part).replace("**", "^").replace("*", "\u00b7").replace("-", "\u2212")
+    plain = re.sub(_GUARD, lambda m: m[1] or "", written(part))
+    plain = re.sub(_NAME, lambda m: name_in_formula(m[0]).replace(" ", "\u00a0"), plain)
+    plain = plain.replace("**", "^").replace("*", "\u00b7").replace("-", "\u2212")
     said = re.sub("[\u00b7/]", r"<wbr>\g<0>", text(plain))
     return f"<code class='formula'>{sign}{said}</code>"
 
@@ -177,6 +192,8 @@ def next_html(improvement: Improvement, result: Mapping[str, Any]) -> str:
     seen: dict[str, list[str]] = {}
     for n in result["not_testable"]:
         key = n["effect"]
+        if shown_by_parts(n["why"]):
+            continue
         if motion := run_that_shows(key, improvement.joint.kind):
             seen.setdefault(motion, []).append(EFFECTS[key].title)
     for motion, titles in sorted(seen.items(), key=lambda p: -len(p[1])):

@@ -388,6 +388,18 @@ def overlay_html(shown: Sequence[Overlay]) -> str:
     )
 
 
+def breaks_said(shown: Sequence[Overlay]) -> str:
+    """Why curves over time break; empty where none does."""
+    most = max((o.broken_percent for o in shown), default=0.0)
+    if most == 0.0:
+        return ""
+    return (
+        " The curves break where rows take no part in the balance, nor in any error: a side whose "
+        "friction acts in it stands still, samples are missing, or a new stretch begins (up to "
+        f"{number(most, 2)} % of the rows of a record)."
+    )
+
+
 def window_charts(o: Overlay) -> tuple[Chart, Chart]:
     """The worst window of an overlay as still pictures: torque, and the residual in a frame of its
     own.

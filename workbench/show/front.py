@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import textwrap
 from typing import Final
 
@@ -14,12 +15,19 @@ from workbench.show.results import spaced, table, text
 
 ROWS: Final = 11
 """Variants that are named beside the picture."""
+LAST: Final = ("score behind", "best in", "note")
 LINE: Final = 15
 LETTERS: Final = 84
 """Letters of a line beside the picture."""
 BESIDE: Final = 560
 FIGURE: Final = 300
 """Height of the picture in a report."""
+GREY: Final = "#8a8d91"
+"""As dots look that are drawn faint."""
+BELOW: Final = (
+    "Grey below the line: a variant that lacks an effect of the joint file, or that whole fits of "
+    "its names rule out; it is no answer."
+)
 WORST: Final = 1.15
 """Error, in units of that of the start model, up to which a variant is drawn."""
 
@@ -31,7 +39,7 @@ def exploration_picture(found: Exploration) -> str:
     dots, front = _dots(found)
     numbers = _numbers(found)
     rows = [
-        f"{numbers[id(v)]}  {_short(v)}: {number(v.relative_error_percent, 3)} %, "
+        f"{numbers[id(v)]}  {_short(v)}: {number(v.error_percent, 3)} % of start, "
         f"{v.parameters} parameters{_said(found, v)}"
         for v in _numbered(found)
     ]
@@ -39,7 +47,7 @@ def exploration_picture(found: Exploration) -> str:
         (r, AFTER if v is found.recommended else INK)
         for r, v in zip(rows, _numbered(found), strict=True)
     ]
-    sentences = [found.reason, found.agreement]
+    sentences = [*filter(None, (found.reason, found.agreement, _below(found)))]
     lines = [w for s in sentences for w in (*textwrap.wrap(s, LETTERS), "")][:-1]
     height = max(LINE * (len(named) + len(lines) + 2), 300)
     picture = front_picture(dots, front, height - 34)
@@ -48,6 +56,7 @@ def exploration_picture(found: Exploration) -> str:
         + _word(150, 18, AFTER, "\u25cb tied")
         + _word(196, 18, BEFORE, "\u25a1 improve")
         + _word(262, 18, AFTER, "\u2500 front")
+        + _word(308, 18, GREY, "\u25cf others")
     )
     y = 18
     beside = ""
@@ -83,13 +92,14 @@ def exploration_section(found: Exploration) -> str:
             text(v.name),
             str(v.parameters),
             f"{number(v.relative_error_percent, 3)} %",
+            f"{number(v.error_percent, 3)} %",
             number(v.score, 2),
             f"{v.chosen_percent:.0f} %",
             text(_said(found, v).strip(" ()")),
         ]
         for k, v in enumerate(_numbered(found), 1)
     ]
-    head = ("dot", "variant", "parameters", "held-out error", "score behind", "best in", "note")
+    head = ("dot", "variant", "parameters", "held-out error", "of start", *LAST)
     tied = text(found.alike)
     said = [found.reason, found.agreement]
     said += [
@@ -102,7 +112,8 @@ def exploration_section(found: Exploration) -> str:
         f"<p>{found.screened} variants of the model were scored and {len(found.variants)} fitted. "
         "A dot is a variant: its error on records that no fit saw, against its free parameters. "
         "The line joins those that no other answer beats with as few; the filled dot is "
-        "recommended, open ones tie with it, and the square is what the improve loop ends with.</p>"
+        "recommended, open ones tie with it, and the square is what the improve loop ends with. "
+        f"{_below(found)}</p>"
         f"<figure>{front_picture(dots, front, FIGURE)}</figure>{paragraphs}"
         f"{table(head, rows, f'Tied: {tied}' if tied else 'Nothing ties with the recommended one')}"
         "<p class='note'>Score behind: sum over the balances of the logarithm of the error on "
@@ -110,6 +121,20 @@ def exploration_section(found: Exploration) -> str:
         "less that of the recommended variant. Best in: share of resampled records in which the "
         "variant has the lowest score.</p>"
     )
+
+
+def _below(found: Exploration) -> str:
+    """Why dots lie below the front; empty where none does."""
+    drawn, front = _drawn(found)
+    beaten = any(
+        v.error_percent
+        < min(
+            (f.error_percent for f in found.front if f.parameters <= v.parameters), default=math.inf
+        )
+        for k, v in enumerate(drawn)
+        if k not in front and (v.dropped or v.behind)
+    )
+    return BELOW if beaten else ""
 
 
 def _numbers(found: Exploration) -> dict[int, int]:

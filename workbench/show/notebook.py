@@ -13,13 +13,14 @@ from identification.data.record import Record
 from identification.diagnosis.compare import Comparison
 from identification.diagnosis.diagnose import Diagnosis
 from identification.diagnosis.improvement import Improvement
+from identification.errors import InputError
 from identification.fitting.fit import Fit
 from identification.linear.frequency import Bode
 from identification.variants.exploration import Exploration
 from workbench.show.bode import bode_html
 from workbench.show.ceiling import ceiling_html
 from workbench.show.front import exploration_html
-from workbench.show.report import render_report
+from workbench.show.report import render_comparison, render_report
 from workbench.show.results import (
     comparison_html,
     diagnosis_html,
@@ -105,19 +106,36 @@ class Interactive:
 
 
 def interactive(
-    result: Improvement, records: Sequence[Record] = (), *, height: int = 720
+    result: Improvement | Diagnosis | Comparison,
+    records: Sequence[Record] = (),
+    *,
+    height: int = 720,
 ) -> Interactive:
-    """The report of a loop inside a notebook: plots in time that zoom, and all that the report has.
+    """A result inside a notebook as its document: of a loop or a diagnosis the report, whose plots
+    in time zoom; of a comparison every place at which the model may fail.
 
     Parameters
     ----------
-    result : Improvement
+    result : Improvement, Diagnosis or Comparison
     records : sequence of Record
-        For the plots over time.
+        For the plots of a report over frequency, and where its figures come from.
     height : int
         [px].
+
+    Raises
+    ------
+    InputError
+        A result of another type.
     """
-    return Interactive(render_report(result, records=records), height)
+    if isinstance(result, Comparison):
+        return Interactive(render_comparison(result), height)
+    found = result.found if isinstance(result, Diagnosis) else result
+    if not isinstance(found, Improvement):
+        raise InputError(
+            "interactive takes what improve, diagnose and compare give, and not "
+            f"{type(result).__name__}; display(result) shows any of them"
+        )
+    return Interactive(render_report(found, records=records), height)
 
 
 __all__ = ["Interactive", "html_of", "interactive"]

@@ -130,6 +130,11 @@ class Overlay:
         return not np.array_equal(self.start, self.final, equal_nan=True)
 
     @property
+    def broken_percent(self) -> float:
+        """Share of the rows in which the curves break."""
+        return 100 * float(np.mean(np.isnan(self.measured)))
+
+    @property
     def quantity(self) -> str:
         """What is measured: a force of a linear axis, else a torque."""
         return "force" if self.unit == "N" else "torque"

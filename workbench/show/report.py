@@ -16,18 +16,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from identification.data.formats import percent, ratio
+from identification.data.formats import number, percent, ratio
 from identification.data.record import Record
+from identification.diagnosis.compare import Comparison
 from identification.diagnosis.improve import Improvement
 from identification.errors import InputError
 from identification.fitting.trust import Trust
 from irj_fmu.command_line import replace_file
 from workbench.show import first_page, fragments
 from workbench.show.beside import beside_html
+from workbench.show.ceiling import ceiling_html
+from workbench.show.pictures import place_picture
 from workbench.show.plots import ReportPlots, overlay_json, report_plots
 from workbench.show.results import (
     calibration_html,
     claims_html,
+    error_html,
     floor_percent,
     ledger_html,
     not_testable_html,
@@ -174,6 +178,23 @@ def render_report(
     )
 
 
+def render_comparison(comparison: Comparison) -> str:
+    """A comparison as a document: errors, every place at which the model may fail, what linear
+    models would explain.
+    """
+    low, high = comparison.worst_window
+    pictures = "".join(f"<figure>{place_picture(p)}</figure>" for p in comparison.places)
+    errors = error_html(comparison.error.as_json(), text(comparison.name))
+    linear = ceiling_html(comparison.linear) if comparison.linear else ""
+    body = (
+        f'<header><p class="eyebrow">Model against record</p><h1>{text(comparison.name)}</h1>'
+        f"</header><main>{warnings_html(comparison.warnings)}{_scrollable(errors)}"
+        f"<p>Worst window: {number(low)} s to {number(high)} s.</p>"
+        f'<h2>Where the model fails</h2><div class="grid">{pictures}</div>{linear}</main>'
+    )
+    return _page(f"{comparison.name}: comparison", body, [], added=False)
+
+
 def _sections(
     improvement: Improvement,
     result: dict[str, Any],
@@ -317,7 +338,7 @@ def _overlay(plots: ReportPlots, where: str, effort: str) -> str:
         "it<span class='screen-only'>. It opens on the window in which the start model is worst; "
         "the lowest plot shows the whole record: drag across it to choose another window</span>"
         "<span class='print-only'>, in the window in which the start model is worst</span>."
-        f"</p>{fragments.overlay_html(plots.overlays)}"
+        f"{fragments.breaks_said(plots.overlays)}</p>{fragments.overlay_html(plots.overlays)}"
     )
 
 

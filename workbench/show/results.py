@@ -65,6 +65,7 @@ def table(
     *,
     classes: Sequence[str] = (),
     wide: bool = False,
+    stacked: bool = False,
 ) -> str:
     """A table from cells that are HTML already; the first cell of a row is its header.
 
@@ -79,14 +80,20 @@ def table(
         Class of each row; may be shorter than the rows.
     wide : bool
         With long texts: a page scrolls it sideways rather than squeeze it.
+    stacked : bool
+        With cells as long as a narrow screen is wide: there they stand below each other, each with
+        its title.
     """
     top = "".join(f'<th scope="col">{h}</th>' for h in head)
     body = []
     for i, row in enumerate(rows):
         kind = f' class="{classes[i]}"' if i < len(classes) and classes[i] else ""
-        cells = "".join(f"<td>{c}</td>" for c in row[1:])
+        cells = "".join(
+            f'<td data-title="{head[k]}">{c}</td>' if stacked else f"<td>{c}</td>"
+            for k, c in enumerate(row[1:], 1)
+        )
         body.append(f'<tr{kind}><th scope="row">{row[0]}</th>{cells}</tr>')
-    shape = ' class="wide"' if wide else ""
+    shape = ' class="stacked"' if stacked else ' class="wide"' if wide else ""
     return (
         f"<table{shape}><caption>{caption}</caption><thead><tr>{top}</tr></thead><tbody>"
         f"{''.join(body)}</tbody></table>"

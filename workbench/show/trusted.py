@@ -30,7 +30,9 @@ def trusted_html(trust: Trust) -> str:
     ]
     rows = [_row(p) for p in trust.parameters]
     classes = ["" if p.verdict == "trust" else "flagged" for p in trust.parameters]
-    return table(head, rows, "Which number to trust", classes=classes, wide=True) + NOTE
+    marked = "; ".join(f"{mark} {said}" for mark, said in trust.marks.items())
+    keys = f"<p class='note'>By record: {text(marked)}.</p>" if marked else ""
+    return table(head, rows, "Which number to trust", classes=classes, wide=True) + keys + NOTE
 
 
 def _row(p: Trusted) -> list[str]:
@@ -41,7 +43,7 @@ def _row(p: Trusted) -> list[str]:
         number(p.value, n),
         band,
         pretty_unit(p.unit) or "–",
-        ", ".join(number(v) for v in p.records) or "–",
+        ", ".join(text(number(v, n) + p.mark(k)) for k, v in enumerate(p.records)) or "–",
         f"{number(p.prediction_percent, 2)} %",
         text(f"{p.verdict}{f': {p.why}' if p.why else ''}"),
         text(p.trade) or "–",

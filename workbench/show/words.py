@@ -6,11 +6,13 @@ one thing: what `irj improve` prints of a result stands on the page line by line
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, final
 
 from casadi_models import EFFECTS
+from identification.balance.dataset import HOLD_NAME
 from identification.data.formats import words
 from identification.diagnosis.improve import Improvement
 from identification.diagnosis.learned import LEARNED
@@ -128,6 +130,21 @@ def title_of(label: str) -> str:
 def plain_name(name: str) -> str:
     """A parameter's name for a reader: underscores as spaces, no mark of an instance."""
     return words(name.partition("#")[0])
+
+
+def name_in_formula(name: str) -> str:
+    """A symbol of the equations for a reader: parameters and signals as words, rates and states of
+    a memory as what they are.
+    """
+    if name == HOLD_NAME:
+        return "hold of the drive"
+    if (rate := re.fullmatch(r"(\w+)_rate", name)) is not None:
+        return f"rate of {words(rate[1])}"
+    if (state := re.fullmatch(r"(\w+)_(\d+)", name)) is not None and any(
+        e.memory is not None and state[1].startswith(e.key) for e in EFFECTS.values()
+    ):
+        return f"state {int(state[2]) + 1} of {words(state[1])}"
+    return plain_name(name)
 
 
 # --- a result, line by line -----------------------------------------------------------------------

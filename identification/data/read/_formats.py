@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from identification.data.read._child import FORMATS, open_in_child
 from identification.data.read._source import opened_packed
+from identification.data.schema import meant
 from identification.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,7 +70,9 @@ def _format(path: Path) -> str:
                 return "rosbag"
             raise InputError(f"{path}: is a folder: name the file in it")
         if not path.exists():
-            raise InputError(f"{path}: there is no such file: check the path")
+            beside = path.parent.iterdir() if path.parent.is_dir() else ()
+            near = meant(path.name, (p.name for p in beside if p.is_file()))
+            raise InputError(f"{path}: there is no such file: check the path{near}")
         if path.stat().st_size == 0:
             raise InputError(f"{path}: is empty (0 bytes): record again or give another file")
         form = _sniff(path)

@@ -15,12 +15,12 @@ import pytest
 import workbench
 from benchmarks.next_run import record_of
 from benchmarks.trust import PLAIN, joint_of
-from identification import Joint
+from identification import Fit, Joint, fit, load_joint, read
 from identification.balance.dataset import Dataset
 from identification.data.joint_file import Known
 from identification.fitting.engine import Solution, load_dataset, prepared_model, solve
 from identification.fitting.information import white_errors
-from identification.fitting.trust import Trusted, trust
+from identification.fitting.trust import Trust, Trusted, _by_error, trust
 from tests.hidden_effect import generator
 from tests.hidden_effect.generator import Case, generate_case, simulate_case
 from workbench.cli.main import main
@@ -195,3 +195,68 @@ def test_values_of_a_model_that_lacks_something_are_doubted(
     doubts = capsys.readouterr().err
     assert "motor" in doubts
     assert "may make up for what is missing" in doubts
+
+
+@cache
+def lacking() -> Fit:
+    """The package's demo, whose motor lacks a law, fitted to both of its records."""
+    folder = Path(workbench.__file__).parent / "demo"
+    given = load_joint(folder / "joint.toml")
+    return fit(given, [read(folder / f"{r}.npz", joint=given) for r in ("train", "held_out")])
+
+
+@cache
+def lacking_judged() -> Trust:
+    return trust(lacking().solution, lacking().data, profiles=False)
+
+
+def test_what_rests_on_a_balance_over_its_noise_is_not_trusted_by_records_or_by_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Motor Coulomb friction was 16 % off, its interval 5 % wide, and the verdict `trust`."""
+    written, told = tmp_path / "fitted.toml", tmp_path / "trust.json"
+    written.write_text(lacking().to_joint_file(), encoding="utf-8")
+    assert main(["trust", "--joint", str(written), "--json", str(told)]) == 0
+    assert "the model lacks a law in the motor balance" in capsys.readouterr().out
+    found = [lacking_judged().as_json(), json.loads(told.read_text())["trust"]]
+    by_name = [{p["name"]: p for p in one} for one in found]
+    for one in by_name:
+        assert one["motor_coulomb"]["verdict"] == "not"
+        assert "lacks a law in the motor balance" in one["motor_coulomb"]["why"]
+        assert one["link_inertia"]["verdict"] == "trust"
+        assert one["stiffness"]["verdict"] == "trust"  # the twist alone tells it
+    both = [{n: [p[k] for k in ("trade", "verdict", "why")] for n, p in q.items()} for q in by_name]
+    assert both[0] == both[1]
+    assert sum(bool(trade) for trade, *_ in both[0].values()) >= 2
+
+
+def test_the_text_has_what_the_data_has() -> None:
+    lines = str(lacking_judged()).splitlines()
+    after = lines[[x.startswith("link_inertia") for x in lines].index(True) + 1]
+    assert re.search(r"by record \S+, \S+; by window .*; moves the prediction by \S+ %$", after)
+
+
+def test_noise_in_the_columns_moves_no_value_by_record() -> None:
+    """Both lay below that of all records: what noise adds to the columns was taken off these
+    only.
+    """
+    p = {p.name: p for p in lacking_judged().parameters}["link_inertia"]
+    assert p.apart == ()
+    low, high = sorted(v for v in p.records if v is not None)
+    assert low < p.value < high
+
+
+def test_a_record_of_another_joint_is_told_from_noise() -> None:
+    p = replace(judged()["link_inertia"], records=(9.0, 9.5, None), low=8.9, high=9.1, apart=(1,))
+    assert p.parts.startswith("by record 9, 9.5!, -; by window")
+    assert replace(p, apart=()).parts.startswith("by record 9, 9.5*, -;")
+    assert "within the error of that record alone" in str(Trust((replace(p, apart=()),)))
+    assert "by more than noise explains" in str(Trust((p,)))
+
+
+def test_an_error_over_ten_percent_is_called_one() -> None:
+    """It said "known to less than 10 %", which is the contrary."""
+    p = judged()["motor_viscous"]
+    weak = _by_error(0.2, 0.9, identified=True)
+    assert p.verdict == "trust" and weak[0] == "only in combination"
+    assert "no better than to 10 %" in weak[1]

@@ -524,6 +524,9 @@ def test_progress_goes_forward_to_its_end(lean: bool, more: bool, base: Base) ->
     assert told == sorted(told)
     assert max(told) <= 1.0
     assert ("quadratic drag would be the next" in found.reason) == (lean and more)
+    # nobody has set a limit
+    assert ("One effect is added at a time" in found.reason) == (lean and more)
+    assert "Stopped at the limit" not in found.reason
 
 
 def test_a_name_that_is_claimed_is_not_said_to_be_untestable(base: Base) -> None:

@@ -84,7 +84,8 @@ def test_the_first_sheet_stands_alone(sheets_of: dict[int, list[Part]], page: An
     assert kinds[1].startswith("section.verdict"), "after author and date"
     assert kinds.count("figure") == 2, "staircase, and the place before and after"
     said = " ".join(p.said for p in front)
-    for needed in ("1.52 %", "0.438 %", "Stribeck effect", "motor_stribeck_extra\u00b7tanh"):
+    law = "motor stribeck extra\u00b7tanh".replace(" ", "\u00a0")
+    for needed in ("1.52 %", "0.438 %", "Stribeck effect", law):
         assert needed in said
     assert "What to measure next" in [p.said for p in front if p.kind == "h2"]
     assert front == parts[: len(front)]

@@ -45,7 +45,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = {
     "plan": ("irj plan --joint fitted.toml --max-speed 90 -o motion.csv",),
     "next": ("irj next run1.csv --joint joint.toml -o motion.csv",),
     "linear": ("irj linear run1.csv --held-out run2.csv --joint joint.toml",),
-    "twostep": ("irj twostep run1.csv --joint joint.toml",),
+    "twostep": ("irj twostep run1.csv --joint joint.toml -o fitted.toml",),
     "prefilter": ("irj prefilter run1.csv --joint joint.toml --cutoff 40 -o smooth.csv",),
     "accelerometer": ("irj accelerometer --up up.csv --down down.csv",),
     "trust": ("irj trust run1.csv --joint joint.toml",),
