@@ -27,6 +27,7 @@ from identification.data.check.relations import (
     check_velocity,
     check_wrapped,
     measured_ratio,
+    shown_ratio,
 )
 from identification.data.check.stamps import check_sampling, check_size, check_stamps
 from identification.data.check.torque import check_torque, check_work
@@ -38,7 +39,16 @@ if TYPE_CHECKING:
 
     from identification.data.record import Record
 
-__all__ = ["SEVERITIES", "Finding", "check", "gate", "measured_ratio", "repair", "require"]
+__all__ = [
+    "SEVERITIES",
+    "Finding",
+    "check",
+    "gate",
+    "measured_ratio",
+    "repair",
+    "require",
+    "shown_ratio",
+]
 
 SHORTEST_PIECE: Final = 8
 
