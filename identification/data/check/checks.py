@@ -13,6 +13,7 @@ from identification.data.check.channels import (
     bridged_rows,
     check_absurd,
     check_constant,
+    check_lost,
     check_nan,
     check_quantisation,
     check_saturation,
@@ -104,6 +105,7 @@ def check(
             findings.append(Finding("refuse", "missing_channel", message, channel))
     stamps = check_stamps(record)
     findings += stamps
+    findings += check_lost(record)
     findings += check_nan(record)
     if any(finding.severity == "refuse" for finding in stamps):
         return rank(findings)

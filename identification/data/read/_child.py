@@ -129,6 +129,7 @@ def open_in_child(path: Path, form: str, module: str, function: str) -> Table:
         said["units"],
         tuple(said["notes"]),
         said["first_row"],
+        said["left"],
     )
 
 
@@ -201,6 +202,7 @@ class _Opened:
             "units": dict(table.units),
             "notes": list(table.notes),
             "first_row": table.first_row,
+            "left": dict(table.left),
         }
         return said, arrays
 
