@@ -395,7 +395,7 @@ class Instance:
                 (_C_TYPES[self.fmu.version][kind] * len(group))(),
                 self._bound(f"Get{kind}"),
                 self._bound(f"Set{kind}"),
-                () if self.fmu.version == 2 else (len(group),),
+                sizes=() if self.fmu.version == 2 else (len(group),),
             )
             for kind, group in groups.items()
         ]
@@ -484,30 +484,30 @@ def _lenient(made: Any) -> Any:
     """
 
     class FMU3(made):  # type: ignore[misc] # fmpy reads the version from the name
-        dll: Any
+        @property
+        def dll(self) -> _Whole:
+            return self._whole
 
-        def _loadFunctions(self) -> None:  # noqa: N802
-            whole = self.dll
-            self.dll = _Whole(whole)
-            try:
-                super()._loadFunctions()
-            finally:
-                self.dll = whole
+        @dll.setter
+        def dll(self, library: Any) -> None:
+            self._whole = _Whole(library)
 
     return FMU3
 
 
 class _Whole:
-    """A library whose missing functions are found out when they are called."""
+    """A library whose missing functions of FMI 3.0 are found out when they are called."""
 
     def __init__(self, library: Any) -> None:
         self._library = library
 
     def __getattr__(self, name: str) -> Any:
-        try:
-            return getattr(self._library, name)
-        except AttributeError:
+        if name.startswith("fmi3") and not hasattr(self._library, name):
             return _Missing()
+        return getattr(self._library, name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._library[name]
 
 
 def logger(messages: list[str]) -> Callable[[Any, int, bytes, bytes], None]:

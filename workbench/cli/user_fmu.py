@@ -405,9 +405,7 @@ def export_parser() -> OneLineParser:
         help="corrected: platform, as linux64 or win64, or all that the FMU has (default: this "
         "machine)",
     )
-    made.add_argument(
-        "--fmi", type=int, choices=(2, 3), help="pair: version of FMI (default: 2)"
-    )
+    made.add_argument("--fmi", type=int, choices=(2, 3), help="pair: version of FMI (default: 2)")
     made.add_argument("--json", metavar="FILE", help="write what was built as JSON")
     return made
 

@@ -129,7 +129,7 @@ def open_in_child(path: Path, form: str, module: str, function: str) -> Table:
         said["units"],
         tuple(said["notes"]),
         said["first_row"],
-        said["left"],
+        left=said["left"],
     )
 
 

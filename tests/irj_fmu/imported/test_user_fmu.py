@@ -404,6 +404,29 @@ def test_the_pair_as_one_fmu_is_the_pair_in_memory(
         assert error < (1e-9 if step == 1e-3 else 0.05 * np.abs(expected - bare).max())
 
 
+def test_what_fits_no_single_window_is_refused_before_all_of_them(folder: Path) -> None:
+    """The speed is said to run backwards."""
+    path = fmu(folder, "Axis", Make(2, CS))
+    model = load_user_model(
+        path,
+        {"motor_torque": "torque", "motor_position": "angle", "motor_velocity": "speed"},
+        ["inertia", "viscous"],
+        start=START,
+        window=0.5,
+    )
+    angle, speed = model.outputs
+    wrong = replace(model, outputs=(angle, replace(speed, scale=-1.0)))
+    record = axis(seconds=4.0)
+    record = record.with_channel(
+        "motor_velocity", np.gradient(record["motor_position"], record.time)
+    )
+    texts: list[str] = []
+    with pytest.raises(InputError, match=r"bring motor_velocity nearer .* than standing still"):
+        fit(wrong, record, progress=lambda text, _: texts.append(text))
+    assert any(text.startswith("fitting one of 8 windows") for text in texts)
+    assert not any("step" in text for text in texts)
+
+
 def test_the_pair_of_fmi_3_is_that_of_fmi_2(folder: Path, pair: UserModel) -> None:
     from fmpy.validation import validate_fmu
 
