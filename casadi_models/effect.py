@@ -13,12 +13,14 @@ import importlib
 import math
 import pkgutil
 import re
+import signal
+import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from types import CodeType, ModuleType, SimpleNamespace
+from types import CodeType, FrameType, ModuleType, SimpleNamespace
 from typing import Any, Final, Literal, final, get_args
 
 import casadi as ca
@@ -458,10 +460,28 @@ class Registry(Mapping[str, Effect]):
         _only_python(path)
         return self.load_code(path, path.read_bytes()).keys
 
-    def load_code(self, path: Path, code: bytes) -> EffectFile:
-        """Run the content of a user's Python file, as it was read (see :meth:`load`)."""
+    def load_code(self, path: Path, code: bytes, *, tried: bool = False) -> EffectFile:
+        """Run the content of a user's Python file, as it was read (see :meth:`load`).
+
+        Parameters
+        ----------
+        path : Path
+        code : bytes
+        tried : bool
+            It was run before, elsewhere, and did not end its process: it is run here at once.
+
+        Raises
+        ------
+        EffectFileError
+            The file ends the process that runs it, or takes too much time or memory.
+        """
+        from .child.trial import ends_it, try_file
+
         where = path.resolve()
         _only_python(path)
+        if not tried:
+            others = (f for f in self._loaded.values() if f.path != where)
+            try_file(path, code, ((f.path, f.code) for f in others))
         kept = dict(self._effects)
         typed = self._scope.get()
         kept_typed = replace(typed, effects=dict(typed.effects), files=dict(typed.files))
@@ -471,15 +491,19 @@ class Registry(Mapping[str, Effect]):
         before = set(self)
         module = ModuleType(f"irj_user_effects_{path.stem}")
         module.__file__ = str(path)
-        try:
-            exec(_compiled(code, path), module.__dict__)
-            self._check_references(set(self) - before, path)
-            for key in sorted(set(self) - before):
-                self[key].check()
-        except BaseException:
-            self._effects = kept
-            typed.effects, typed.files = kept_typed.effects, kept_typed.files
-            raise
+        with _pressed() as pressed:
+            try:
+                exec(_compiled(code, path), module.__dict__)
+                self._check_references(set(self) - before, path)
+                for key in sorted(set(self) - before):
+                    self[key].check()
+            except BaseException as error:
+                self._effects = kept
+                typed.effects, typed.files = kept_typed.effects, kept_typed.files
+                if isinstance(error, Exception) or pressed:
+                    raise
+                said = f": {error}" if str(error) else ""
+                raise ends_it(path, f"{type(error).__name__}{said}") from None
         keys = tuple(sorted(set(self) - before))
         self._loaded[where] = EffectFile(where, hashlib.sha256(code).hexdigest(), keys, code)
         return self._loaded[where]
@@ -545,6 +569,26 @@ def _only_python(path: Path) -> None:
 
 
 EFFECTS: Final = Registry()
+
+
+@contextlib.contextmanager
+def _pressed() -> Iterator[list[int]]:
+    """Interrupts from the keyboard, to tell them from those that a file raises itself."""
+    pressed: list[int] = []
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield pressed  # none reaches this thread
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        pressed.append(number)
+        handler(number, frame)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _compiled(code: bytes, path: Path) -> CodeType:

@@ -61,7 +61,7 @@ def write_cross_check(fmu: Path, out: Path, drives: Mapping[str, Signal]) -> lis
     FmuError
         Where the FMU refuses a call.
     """
-    with Fmu(fmu) as opened:
+    with Fmu(fmu, (2,)) as opened:
         about, name = opened.description, Path(fmu).stem
         platforms = sorted(
             {n.split("/")[1] for n in zipfile.ZipFile(fmu).namelist() if n.startswith("binaries/")}

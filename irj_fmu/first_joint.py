@@ -14,6 +14,7 @@ import numpy as np
 
 from casadi_models import EFFECTS
 from identification.data.channels import channel_unit
+from identification.data.check.checks import shown_ratio
 from identification.data.guess import guess_columns
 from identification.data.joint_file import Joint
 from identification.data.plain_text import toml_key, toml_string
@@ -123,14 +124,16 @@ def _ratio(record: Record, joint: Joint | None) -> tuple[float, str]:
     """The gear ratio and where it comes from."""
     if joint is not None:
         return joint.gear_ratio, "as given"
-    if not (record.has("motor_position") and record.has("link_position")):
-        return 1.0, "CHECK: one side is recorded; 1 where the FMU and the record are of one side"
-    motor, link = (record[f"{s}_position"] for s in SIDES)
-    slope = float(np.polyfit(link, motor, 1)[0])
+    shown = shown_ratio(record)
+    if shown is None:
+        one = "only one side is recorded or moves"
+        return 1.0, f"CHECK: {one}; 1 where the FMU and the record are of one side"
+    slope, bare = shown
     near = round(slope)
     found = float(near) if near and abs(slope / near - 1) < WHOLE else slope
     how = f" ({slope:.6g}, taken as a whole number: CHECK)" if found != slope else ""
-    return found, f"theta_motor / theta_link, from the two encoders of the record{how}"
+    off = ", torsion taken off" if bare else ""
+    return found, f"theta_motor / theta_link, from the two encoders of the record{off}{how}"
 
 
 def _channels(

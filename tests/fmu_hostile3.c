@@ -1,4 +1,4 @@
-/* The same as fmu_hostile.c for FMI 3.0, model exchange and co-simulation: fmu_hostile3 LIBRARY TOKEN REAL_VR STATES;
+/* The same as fmu_hostile.c for FMI 3.0, model exchange and co-simulation: fmu_hostile3 LIBRARY TOKEN REAL_VR STATES [RESOURCES];
  * without states it is co-simulation only */
 #include <dlfcn.h>
 #include <math.h>
@@ -8,6 +8,7 @@
 #include "fmi3Functions.h"
 
 static int lines, failures;
+static const char *resources;
 
 static void logger(fmi3InstanceEnvironment e, fmi3Status status, fmi3String category, fmi3String message) {
     (void)e; (void)status; (void)category;
@@ -92,7 +93,7 @@ static void run(fmi3Instance c, size_t n) {
 static void run_steps(const char *token, size_t n) {
     fmi3Float64 x[64] = {0}, last = -1;
     fmi3Boolean flag[5];
-    fmi3Instance c = fInstantiateCoSimulation("a", token, NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL);
+    fmi3Instance c = fInstantiateCoSimulation("a", token, resources, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL);
     check("instantiate for co-simulation", c != NULL);
     if (!c) return;
     REFUSED(fDoStep(c, 0, 1e-3, 1, flag, flag + 1, flag + 2, &last));
@@ -120,9 +121,9 @@ static void run_steps(const char *token, size_t n) {
 
 /* What is probed in main: for model exchange, or for co-simulation where that is all there is. */
 static fmi3Instance born_as(const char *token, size_t n) {
-    if (n) return fInstantiateModelExchange("a", token, NULL, 0, 0, NULL, logger);
-    NONE(fInstantiateModelExchange("a", token, NULL, 0, 0, NULL, logger));
-    return fInstantiateCoSimulation("a", token, NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL);
+    if (n) return fInstantiateModelExchange("a", token, resources, 0, 0, NULL, logger);
+    NONE(fInstantiateModelExchange("a", token, resources, 0, 0, NULL, logger));
+    return fInstantiateCoSimulation("a", token, resources, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL);
 }
 
 static void ready(fmi3Instance c, size_t n) {
@@ -146,15 +147,15 @@ int main(int argc, char **argv) {
     fmi3Int32 whole[1];
     fmi3Boolean flag[5] = {0};
     void *library = dlopen(argv[1], RTLD_NOW | RTLD_LOCAL);
-    (void)argc;
+    resources = argc > 5 ? argv[5] : NULL;
     if (!library) { fprintf(stderr, "%s\n", dlerror()); return 2; }
 #define GET(name) if (!(*(void **)&f##name = dlsym(library, "fmi3" #name))) { fprintf(stderr, "no fmi3" #name "\n"); return 3; }
     FUNCTIONS(GET)
     NONE(fInstantiateModelExchange("a", "{wrong}", NULL, 0, 0, NULL, logger));
     NONE(fInstantiateModelExchange("a", NULL, NULL, 0, 0, NULL, logger));
     NONE(fInstantiateCoSimulation("a", "{wrong}", NULL, 0, 0, 0, 0, NULL, 0, NULL, logger, NULL));
-    NONE(fInstantiateCoSimulation("a", token, NULL, 0, 0, 1, 0, NULL, 0, NULL, logger, NULL));
-    NONE(fInstantiateScheduledExecution("a", token, NULL, 0, 0, NULL, logger, NULL, NULL, NULL));
+    NONE(fInstantiateCoSimulation("a", token, resources, 0, 0, 1, 0, NULL, 0, NULL, logger, NULL));
+    NONE(fInstantiateScheduledExecution("a", token, resources, 0, 0, NULL, logger, NULL, NULL, NULL));
     check("no logger", !fInstantiateModelExchange(NULL, NULL, NULL, 0, 0, NULL, NULL));
 
     c = born_as(token, n);

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from casadi_models import EFFECTS
+from casadi_models.child.trial import EffectFileError
 from casadi_models.effect import EffectFile
 from identification.data.joint_schema import OWN_EFFECTS
 from identification.data.plain_text import toml_string
@@ -159,10 +160,11 @@ def _loaded(path: Path, content: bytes) -> EffectFile:
             warnings.simplefilter(
                 "ignore"
             )  # Python's own remarks on the text; what matters is an error
-            return EFFECTS.load_code(path, content)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # a user's file may fail in any way, or end the program
+            tried = hashlib.sha256(content).hexdigest() in _allowed()  # it was loaded then
+            return EFFECTS.load_code(path, content, tried=tried)
+    except EffectFileError as error:
+        raise InputError(str(error)) from None
+    except Exception as error:  # a user's file may fail in any way
         raise InputError(
             f"{path}: cannot be used as effects ({type(error).__name__}: {error})"
         ) from None

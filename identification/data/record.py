@@ -70,6 +70,8 @@ class Provenance:
         The column map used, one sentence a channel.
     notes : tuple of str
         Repairs and conversions, in the order they were made.
+    lost : tuple of (channel, why)
+        Channels that the source names and does not give.
     checked : Checked, optional
         Set by the gate, taken off where values change; a part of a checked record is checked.
     """
@@ -80,6 +82,7 @@ class Provenance:
     columns: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     checked: Checked | None = None
+    lost: tuple[tuple[str, str], ...] = ()
 
     def noted(self, *notes: str) -> Provenance:
         """Return the same provenance with notes added."""
@@ -548,6 +551,7 @@ def concat(records: Sequence[Record], name: str | None = None) -> Record:
             " + ".join(dict.fromkeys(record.provenance.reader for record in records)),
             tuple(dict.fromkeys(line for record in records for line in record.provenance.columns)),
             tuple(notes),
+            lost=tuple(dict.fromkeys(one for record in records for one in record.provenance.lost)),
         ),
         age=None
         if all(record.age is None for record in records)

@@ -116,7 +116,7 @@ def _done(parcel: Parcel, folder: Path) -> Found:
     there = {f.code for f in EFFECTS.files}
     for name, code in parcel.own_effects:
         if code not in there:
-            EFFECTS.load_code(folder / name, code)
+            EFFECTS.load_code(folder / name, code, tried=True)
     place = folder / parcel.joint[0]
     place.write_bytes(parcel.joint[1])
     task: Callable[[list[Record], list[Record]], Found]

@@ -25,6 +25,7 @@ from identification.scratch import deaf_children
 from irj_fmu.batch.case import Batch
 from irj_fmu.batch.store import Store
 from irj_fmu.batch.worker import FIGURES, Chunk, Done, empty, enter, run_chunk
+from irj_fmu.host.fmu import WHOLE
 from irj_fmu.host.run import Fmu, FmuError, Number
 from irj_fmu.host.signals import FloatArray
 
@@ -208,10 +209,7 @@ def check(batch: Batch) -> None:
     if not batch.record:
         raise InputError("batch: record names no variable; name at least one")
     with Fmu(batch.fmu) as fmu:
-        if fmu.description.coSimulation is None:
-            raise InputError(
-                f"{fmu.path}: this FMU supports model exchange only; a batch needs co-simulation"
-            )
+        fmu.kind()
         for name in dict.fromkeys(
             (
                 *batch.record,
@@ -222,10 +220,7 @@ def check(batch: Batch) -> None:
         ):
             fmu.variable(name)
         for name in (*batch.record, *batch.inputs):
-            if fmu.variable(name).type == "String":
-                raise InputError(
-                    f"{fmu.path.name}: variable {name!r} is a String and cannot be a signal"
-                )
+            fmu.signal(name)
         for name in batch.inputs:
             if fmu.variable(name).causality != "input":
                 raise InputError(
@@ -243,7 +238,7 @@ def _check_value(fmu: Fmu, name: str, value: Number | str) -> None:
     fits = isinstance(value, str) if kind == "String" else not isinstance(value, str | bool)
     if kind == "Boolean":
         fits = isinstance(value, bool) or value in (0, 1)
-    elif kind in ("Integer", "Enumeration"):
+    elif kind == "Enumeration" or kind in WHOLE:
         fits = not isinstance(value, str | bool) and float(value).is_integer()
     if not fits:
         raise InputError(

@@ -230,7 +230,9 @@ def _planned(model: _Model, run: tuple[str, Record] | None, study: Study) -> Pla
             else float(getattr(fmu.description.defaultExperiment, "stepSize", None) or 1e-3)
         )
         names = study.record or tuple(
-            v.name for v in fmu.variables.values() if v.causality == "output" and v.type != "String"
+            v.name
+            for v in fmu.variables.values()
+            if v.causality == "output" and fmu.carries(v.name)
         )
         fixed: dict[str, Value] = {}
         inputs: dict[str, Table] = {}

@@ -77,7 +77,7 @@ def user_plant(entry: ModelEntry, out: Path) -> UserPlant:
     Raises
     ------
     InputError
-        A key that goes with an FMU that is built; an FMU without co-simulation.
+        A key that goes with an FMU that is built; an FMU that cannot be run.
     """
     from irj_fmu.imported.file import load_user_joint
 
@@ -88,11 +88,7 @@ def user_plant(entry: ModelEntry, out: Path) -> UserPlant:
             f"{entry.path}: its model is an FMU, which is run as it is; take {given} out"
         )
     model = load_user_joint(entry.path)
-    if model.fmu.description.coSimulation is None:
-        raise InputError(
-            f"{model.fmu.path.name}: has no co-simulation, which a study runs; export it as one, "
-            'or fit it, as task = "fit" does'
-        )
+    model.fmu.kinds()  # says what is missing
     if model.correction is None:
         return UserPlant(model, model.fmu.path)
     from irj_fmu.corrected.build import export_corrected

@@ -17,6 +17,7 @@ from typing import Final, final
 
 import numpy as np
 
+from irj_fmu.host.exchange import Exchange, simulate_me
 from irj_fmu.host.run import Fmu, Instance, Number, Wiring, simulate_cs
 from irj_fmu.host.signals import FloatArray, Table
 
@@ -101,8 +102,14 @@ def run_chunk(chunk: Chunk) -> Done:
             record=record,
         )
         try:
-            run = simulate_cs(_instance(chunk), wiring, step=chunk.step, stop=chunk.stop)
-            table = np.column_stack([run[name] for name in record])
+            instance = _instance(chunk)
+            if instance.kind == "cs":
+                run = simulate_cs(instance, wiring, step=chunk.step, stop=chunk.stop)
+                table = np.column_stack([run[name] for name in record])
+            else:
+                options = Exchange(inputs=chunk.inputs, parameters=case, record=chunk.record)
+                run = simulate_me(instance, grid, options)
+                table = np.column_stack([run[name] for name in chunk.record])
             whole = np.isfinite(table)
             if not whole.all():
                 row = int(np.argmin(whole.all(axis=1)))
@@ -147,7 +154,7 @@ def _instance(chunk: Chunk) -> Instance:
     forget()
     fmu = Fmu(_place(chunk))
     try:
-        instance = Instance(fmu)
+        instance = Instance(fmu, fmu.kind())
     except Exception:
         fmu.close()
         raise

@@ -33,6 +33,7 @@ static fmi3Status fail(Corrected *m, const char *format, ...) {
 typedef Corrected Instance;
 #define PASSES_ON
 #define TOKEN CORRECTED_GUID
+#define COSIMULATION_ONLY
 #include "fmi3_common.c"
 
 /* ---- the inner FMU -------------------------------------------------------- */
@@ -94,13 +95,6 @@ static fmi3Status set_starts(Corrected *m) {
 
 static void silent(fmi3InstanceEnvironment e, fmi3Status status, fmi3String category, fmi3String message) {
     (void)e; (void)status; (void)category; (void)message;
-}
-
-fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
-                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
-    (void)name; (void)token; (void)resources; (void)visible; (void)logging;
-    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: this FMU is for co-simulation only");
-    return NULL;
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
@@ -299,22 +293,3 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 length, fmi3Boo
     *last = m->s.t;
     return status;
 }
-
-/* ---- what it does not provide --------------------------------------------- */
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns, fmi3Float64 out[], size_t no) REFUSE("directional derivatives are not provided")
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns, fmi3Float64 out[], size_t no) REFUSE("adjoint derivatives are not provided")
-#define ONLY_EXCHANGE REFUSE("this FMU is for co-simulation only")
-fmi3Status fmi3EnterEventMode(fmi3Instance c) REFUSE("this FMU has no event mode in co-simulation")
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) REFUSE("this FMU has no event mode in co-simulation")
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d, fmi3Boolean *e, fmi3Boolean *f, fmi3Float64 *t) REFUSE("this FMU has no event mode in co-simulation")
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) ONLY_EXCHANGE
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean n, fmi3Boolean *event, fmi3Boolean *stop) ONLY_EXCHANGE
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) ONLY_EXCHANGE
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) ONLY_EXCHANGE
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) ONLY_EXCHANGE
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) ONLY_EXCHANGE
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) ONLY_EXCHANGE
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) ONLY_EXCHANGE
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) ONLY_EXCHANGE
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) ONLY_EXCHANGE

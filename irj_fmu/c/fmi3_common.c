@@ -1,8 +1,9 @@
-/* What both FMI 3.0 wrappers answer alike, included by them.
+/* What the FMI 3.0 wrappers answer alike, included by them.
  *
  * Before it stand: Instance with State s (which begins with the token), environment and log; TOKEN; fail(instance, format,
  * ...); restored(instance), called when another state was put into it. A wrapper round another FMU, which passes calls on, defines
- * PASSES_ON and answers those of the life cycle, of binary variables and of the FMU state itself.
+ * PASSES_ON and answers those of the life cycle, of binary variables and of the FMU state itself. One without model exchange
+ * and derivatives defines COSIMULATION_ONLY.
  */
 
 #include "living.c"
@@ -114,3 +115,43 @@ fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference v, fmi3
 fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t *n) REFUSE("dependencies are not provided")
 fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference v, size_t a[], fmi3ValueReference b[], size_t d[], fmi3DependencyKind e[],
                                        size_t n) REFUSE("dependencies are not provided")
+
+/* Variables of a type of which there are none. */
+#define NO_VARIABLES(name) \
+    fmi3Status fmi3Get##name(fmi3Instance c, References vr, size_t n, fmi3##name value[], size_t length) { \
+        LIVING("fmi3Get" #name); \
+        return n ? fail(c, "get" #name ": there are no such variables") : fmi3OK; \
+    } \
+    fmi3Status fmi3Set##name(fmi3Instance c, References vr, size_t n, const fmi3##name value[], size_t length) { \
+        LIVING("fmi3Set" #name); \
+        return n ? fail(c, "set" #name ": there are no such variables") : fmi3OK; \
+    }
+
+#ifdef COSIMULATION_ONLY
+/* ---- what a co-simulation does not provide; some hosts look for it in every FMU ---- */
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: co-simulation only");
+    return NULL;
+}
+
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
+                                        fmi3Float64 out[], size_t no) REFUSE("directional derivatives are not provided")
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
+                                    fmi3Float64 out[], size_t no) REFUSE("adjoint derivatives are not provided")
+#define ONLY_EXCHANGE REFUSE("this FMU is for co-simulation only")
+fmi3Status fmi3EnterEventMode(fmi3Instance c) REFUSE("this FMU has no event mode in co-simulation")
+fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) REFUSE("this FMU has no event mode in co-simulation")
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *d, fmi3Boolean *e, fmi3Boolean *f, fmi3Float64 *t) REFUSE("this FMU has no event mode in co-simulation")
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) ONLY_EXCHANGE
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean n, fmi3Boolean *event, fmi3Boolean *stop) ONLY_EXCHANGE
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) ONLY_EXCHANGE
+fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) ONLY_EXCHANGE
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) ONLY_EXCHANGE
+fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) ONLY_EXCHANGE
+fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) ONLY_EXCHANGE
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) ONLY_EXCHANGE
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) ONLY_EXCHANGE
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) ONLY_EXCHANGE
+#endif

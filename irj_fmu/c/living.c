@@ -3,6 +3,8 @@
  * Handles are only compared. Entries are reused and given back when the library goes: one thread may look while others
  * make and free instances.
  */
+#ifndef LIVING_C /* a library round another wrapper includes it twice */
+#define LIVING_C
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -80,3 +82,4 @@ static void tell_stranger(const char *call) {
     if (__atomic_fetch_add(&told, 1, __ATOMIC_RELAXED) < STRANGERS_TOLD)
         fprintf(stderr, "%s: the instance is NULL, was freed already or is not of this FMU\n", call);
 }
+#endif

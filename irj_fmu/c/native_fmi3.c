@@ -49,15 +49,10 @@ typedef Twin Instance;
 #define TOKEN NATIVE_GUID
 static void restored(Twin *m) { (void)m; }
 static void discard(Twin *m) { free(m); } /* the first member of what was made */
+#define COSIMULATION_ONLY
 #include "fmi3_common.c"
 
 /* ---- life cycle --------------------------------------------------------------------------------------------------- */
-
-fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
-                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
-    if (log) log(environment, fmi3Error, "logStatusError", "instantiate: co-simulation only");
-    return NULL;
-}
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
                                          fmi3Boolean events, fmi3Boolean early, const fmi3ValueReference required[], size_t n,
@@ -196,15 +191,6 @@ fmi3Status fmi3SetString(fmi3Instance c, References vr, size_t n, const fmi3Stri
     return fmi3OK;
 }
 
-#define NO_VARIABLES(name) \
-    fmi3Status fmi3Get##name(fmi3Instance c, References vr, size_t n, fmi3##name value[], size_t length) { \
-        LIVING("fmi3Get" #name); \
-        return n ? fail(c, "get" #name ": there are no such variables") : fmi3OK; \
-    } \
-    fmi3Status fmi3Set##name(fmi3Instance c, References vr, size_t n, const fmi3##name value[], size_t length) { \
-        LIVING("fmi3Set" #name); \
-        return n ? fail(c, "set" #name ": there are no such variables") : fmi3OK; \
-    }
 NO_VARIABLES(Float32)
 NO_VARIABLES(Int8)
 NO_VARIABLES(UInt8)
@@ -212,11 +198,6 @@ NO_VARIABLES(Int16)
 NO_VARIABLES(UInt16)
 NO_VARIABLES(UInt32)
 NO_VARIABLES(UInt64)
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
-                                        fmi3Float64 out[], size_t no) REFUSE("directional derivatives are not provided")
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, References u, size_t n, References k, size_t nk, const fmi3Float64 seed[], size_t ns,
-                                    fmi3Float64 out[], size_t no) REFUSE("adjoint derivatives are not provided")
 
 /* ---- co-simulation ------------------------------------------------------------------------------------------------ */
 
@@ -231,21 +212,3 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 length, fmi3Boo
     *last = t + length;
     return fmi3OK;
 }
-
-fmi3Status fmi3EnterEventMode(fmi3Instance c) REFUSE("there is no event mode")
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) REFUSE("there is no event mode")
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *stop, fmi3Boolean *nominals, fmi3Boolean *values, fmi3Boolean *planned,
-                                    fmi3Float64 *next) REFUSE("there is no event mode")
-
-/* Some hosts look for these in every FMU. */
-#define EXCHANGE "this FMU is for co-simulation"
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) REFUSE(EXCHANGE)
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *event, fmi3Boolean *stop) REFUSE(EXCHANGE)
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 t) REFUSE(EXCHANGE)
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 z[], size_t n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) REFUSE(EXCHANGE)
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) REFUSE(EXCHANGE)

@@ -199,15 +199,6 @@ fmi3Status fmi3GetFloat64(fmi3Instance c, References vr, size_t n, fmi3Float64 v
     return fmi3OK;
 }
 
-#define NO_VARIABLES(name) \
-    fmi3Status fmi3Get##name(fmi3Instance c, References vr, size_t n, fmi3##name value[], size_t length) { \
-        LIVING("fmi3Get" #name); \
-        return n ? fail(c, "get" #name ": all variables are Float64") : fmi3OK; \
-    } \
-    fmi3Status fmi3Set##name(fmi3Instance c, References vr, size_t n, const fmi3##name value[], size_t length) { \
-        LIVING("fmi3Set" #name); \
-        return n ? fail(c, "set" #name ": all variables are Float64") : fmi3OK; \
-    }
 NO_VARIABLES(Float32)
 NO_VARIABLES(Int8)
 NO_VARIABLES(UInt8)

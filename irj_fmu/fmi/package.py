@@ -1,5 +1,5 @@
-"""Slave FMUs: a Python slave, the project packages it needs and its files in one FMI 2.0
-co-simulation archive.
+"""Slave FMUs: a Python slave, the project packages it needs and its files in one
+co-simulation archive of FMI 2.0 or 3.0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from identification.errors import InputError
 from irj_fmu.command_line import checkpoint
 from irj_fmu.fmi.archive import content_guid, write_archive
 from irj_fmu.fmi.compiler import compile_library, find_compiler, header_folder
+from irj_fmu.fmi.description_fmi3 import said_in_fmi3, time_reference
 from irj_fmu.fmi.documentation import Note, beside, licence_of
+from irj_fmu.fmi.targets import FMI3_FOLDERS
 
 _HERE = Path(__file__).parent
 _MINIMUM = ("slave_base.py", "variables.py", "unit_definitions.py", "model_description.py")
@@ -84,7 +86,7 @@ class Packaged:
 
 
 def package_slave(
-    spec: SlaveSpec, out: Path, *, cc: str | None = None, shim: bool = True
+    spec: SlaveSpec, out: Path, *, cc: str | None = None, shim: bool = True, fmi: int = 2
 ) -> Packaged:
     """Write the FMU of a slave.
 
@@ -98,6 +100,8 @@ def package_slave(
         Compiler of the shim, see `irj_fmu.fmi.compiler.find_compiler`.
     shim : bool
         False leaves the shim out even where there is a compiler.
+    fmi : {2, 3}
+        Version of FMI. In FMI 3.0 the shim is the library, so there is no FMU without it.
 
     Returns
     -------
@@ -121,15 +125,24 @@ def package_slave(
         )
     bundle = _bundle(spec)
     resources = _resources(spec, bundle)
-    guid = content_guid(resources | {"identifier": spec.identifier.encode()})
+    version = {} if fmi == 2 else {"fmi": b"3"}
+    guid = content_guid(resources | {"identifier": spec.identifier.encode(), **version})
     content = {f"resources/{name}": code for name, code in resources.items()}
-    content["modelDescription.xml"] = _describe(spec, resources, guid)
+    described = _describe(spec, resources, guid)
+    content["modelDescription.xml"] = described if fmi == 2 else said_in_fmi3(described)
     content |= beside(
         content["modelDescription.xml"], spec.notes, {"pythonfmu": licence_of("pythonfmu")}
     )
     inner = _pythonfmu_binaries()
     note = "holds the shim: runs in Python hosts and C hosts"
     library: bytes | None = None
+    if fmi == 3:
+        library = _compile_shim(spec, described, _third_party(bundle), cc, "slave_fmi3.c")
+        place = f"binaries/{FMI3_FOLDERS[_SHIM_TARGET]}"
+        content[f"{place}/{spec.identifier}.so"] = library
+        (code,) = (code for name, code in inner.items() if name.startswith("linux64/"))
+        content[f"{place}/{_inner_name(spec)}"] = code
+        return Packaged(write_archive(out, content), True, f"{note}, on Linux")
     if shim:
         try:
             find_compiler(_SHIM_TARGET, cc)
@@ -137,7 +150,7 @@ def package_slave(
         except InputError as error:
             note = _NO_SHIM.format(reason=str(error).split(":")[0])
         else:
-            library = _compile_shim(spec, content["modelDescription.xml"], _third_party(bundle), cc)
+            library = _compile_shim(spec, described, _third_party(bundle), cc)
     else:
         note = _NO_SHIM.format(reason="left out on request")
     for name, code in inner.items():
@@ -365,7 +378,11 @@ def _kinds(description: ElementTree.Element) -> str:
 
 
 def _compile_shim(
-    spec: SlaveSpec, description: bytes, needed: Iterable[str], cc: str | None
+    spec: SlaveSpec,
+    description: bytes,
+    needed: Iterable[str],
+    cc: str | None,
+    main: str = "slave_shim.c",
 ) -> bytes:
     root = ElementTree.fromstring(description)
     quoted = ", ".join(json.dumps(path, ensure_ascii=False) for path in _libpython_candidates())
@@ -375,11 +392,11 @@ def _compile_shim(
         "KINDS": json.dumps(_kinds(root)),
         "MODULES": json.dumps(" ".join(needed)),
         "LIBPYTHON_CANDIDATES": quoted,
+        "VR_TIME": f"{time_reference(root)}u",
     }
     config = "".join(f"#define {name} {text}\n" for name, text in defined.items())
     sources = {
-        name: (_HERE.parent / "c" / name).read_bytes() for name in ("slave_shim.c", "living.c")
+        name: (_HERE.parent / "c" / name).read_bytes()
+        for name in dict.fromkeys((main, "slave_shim.c", "living.c", "fmi3_common.c"))
     } | {"shim_config.h": config.encode()}
-    return compile_library(
-        sources, "slave_shim.c", _SHIM_TARGET, cc=cc, libraries=("dl", "pthread")
-    )
+    return compile_library(sources, main, _SHIM_TARGET, cc=cc, libraries=("dl", "pthread"))

@@ -83,7 +83,7 @@ def write_ssp(system: System, out: Path) -> Path:
     elements = SubElement(top, "ssd:Elements")
     variables: dict[str, Any] = {}
     for name, path in system.components.items():
-        with Fmu(path) as fmu:
+        with Fmu(path, (2,)) as fmu:  # connectors of SSP 1.0 have no types of FMI 3.0
             own = {f"{name}.{key}": v for key, v in fmu.variables.items()}
             variables |= own
             content[f"resources/{name}.fmu"] = Path(path).read_bytes()

@@ -43,6 +43,11 @@ def described(folder: Path) -> Any:
     return found
 
 
+def has_state_events(description: Any) -> bool:
+    """True where its model exchange jumps at events, which runs here do not look for."""
+    return bool(description.numberOfEventIndicators or len(description.eventIndicators))
+
+
 def unreadable(path: Path, error: Exception) -> InputError:
     """The one line on an FMU that cannot be read.
 
@@ -63,4 +68,4 @@ def unreadable(path: Path, error: Exception) -> InputError:
     return InputError(f"{path}: not a readable FMU ({why})")
 
 
-__all__ = ["INHERITED", "described", "unreadable"]
+__all__ = ["INHERITED", "described", "has_state_events", "unreadable"]

@@ -11,6 +11,7 @@ Method: Dormand & Prince, J. Comput. Appl. Math. 6 (1980) 19-26; step control af
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import final
@@ -18,6 +19,7 @@ from typing import final
 import numpy as np
 
 from identification.errors import InputError
+from irj_fmu.host.described import has_state_events
 from irj_fmu.host.run import FmuError, Instance, Number, Trajectory
 from irj_fmu.host.signals import FloatArray, Signal, Table
 
@@ -90,14 +92,14 @@ def simulate_me(
     times = np.asarray(times, dtype=float)
     if times.ndim != 1 or times.size < 2 or not np.all(np.diff(times) > 0):
         raise InputError("model exchange: give at least two increasing output times")
-    if instance.fmu.description.numberOfEventIndicators:
+    if has_state_events(instance.fmu.description):
         raise InputError(
             f"{instance.fmu.path.name}: state events are not supported; use its co-simulation"
         )
     record = tuple(options.record) or tuple(
         name
         for name, v in instance.fmu.variables.items()
-        if v.causality == "output" and v.type == "Real"
+        if v.causality == "output" and v.type in ("Real", "Float64") and not v.shape
     )
     driver = _Driver(instance, options)
     x = driver.start(float(times[0]))
@@ -128,11 +130,19 @@ class _Driver:
             isinstance(signal, Table) and signal.hold for signal in options.inputs.values()
         ]
         blocks = instance.blocks(names)
-        if any(block.type != "Real" for block in blocks):
+        if len(blocks) > 1 or any(not block.real for block in blocks):
             raise InputError(f"{instance.fmu.path.name}: model exchange takes Real inputs only")
         self.block = blocks[0] if blocks else None
         self.signals: list[Callable[[float], float]] = [options.inputs[name] for name in names]
-        self.size = len(instance.fmu.description.derivatives)
+        slopes = [d.variable for d in instance.fmu.description.derivatives]
+        self.size = sum(math.prod(v.shape or ()) for v in slopes)  # FMI 3.0 has arrays of states
+        version = instance.fmu.version
+        self.give, self.take = (
+            f"fmi{version}SetContinuousStates",
+            "fmi2GetDerivatives" if version == 2 else "fmi3GetContinuousStateDerivatives",
+        )
+        part = instance.fmu.description.modelExchange
+        self.completed: bool = bool(part.needsCompletedIntegratorStep)
         self.x = (ctypes.c_double * self.size)()
         self.dx = (ctypes.c_double * self.size)()
         self.view: FloatArray = np.ctypeslib.as_array(self.dx)
@@ -146,8 +156,6 @@ class _Driver:
         instance.begin(time, self.options.parameters)
         self.set_inputs(time, time)
         instance.ready()
-        instance.call("newDiscreteStates")
-        instance.call("enterContinuousTimeMode")
         instance.call("getContinuousStates", self.x, self.size)
         nominal = (ctypes.c_double * self.size)()
         instance.call("getNominalsOfContinuousStates", nominal, self.size)
@@ -184,9 +192,9 @@ class _Driver:
         raw = self.instance.raw
         self.state[:] = x
         self.instance.call("setTime", time)
-        self.instance.call("fmi2SetContinuousStates", raw.component, self.x, self.size)
+        self.instance.call(self.give, raw.component, self.x, self.size)
         self.set_inputs(time, begin)
-        self.instance.call("fmi2GetDerivatives", raw.component, self.dx, self.size)
+        self.instance.call(self.take, raw.component, self.dx, self.size)
         return self.view.copy()
 
     def advance(self, begin: float, end: float, x: FloatArray) -> FloatArray:
@@ -194,9 +202,17 @@ class _Driver:
         stepper = self.stepper
         if stepper is None:
             stepper = self.stepper = Stepper(
-                self.instance.name, self.nominal, self.options.rtol, self.options.atol
+                self.instance.name,
+                self.nominal,
+                self.options.rtol,
+                self.options.atol,
+                self.accept if self.completed else None,
             )
         return stepper.advance(lambda time, state: self.slope(time, state, begin), begin, end, x)
+
+    def accept(self, _time: float, _x: FloatArray) -> None:
+        """Tell the FMU that the step to the time and state last evaluated is done."""
+        self.instance.call("completedIntegratorStep")
 
 
 @final

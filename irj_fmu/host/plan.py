@@ -96,13 +96,13 @@ class Plan:
             signal = wiring.inputs.get(full)
             columns.append(np.zeros(len(time)) if signal is None else _sampled(signal, time))
         rows = np.column_stack(columns)
-        if block.type != "Real":
+        if not block.real:
             if not np.isfinite(rows).all():
                 raise InputError(
                     f"{place[0]}{block.names[0]}: an input of type {block.type} is fed with NaN "
                     "or infinity; feed numbers"
                 )
-            rows = rows.astype(np.int32)
+            rows = rows.astype(np.int64)
         return _Feed(instance, block, _array(block), rows, tuple(live))
 
     def exchange(self, point: int) -> None:
@@ -120,7 +120,7 @@ class Plan:
                 fault = wiring.faults.get(name)
                 if fault is not None:
                     value = fault(self.times[point], value)
-                if feed.block.type != "Real":
+                if not feed.block.real:
                     if not math.isfinite(value):
                         raise InputError(
                             f"{name}: an input of type {feed.block.type} is fed with {value}; "
@@ -141,7 +141,7 @@ _Place = tuple[str, "Instance", "Block"]
 
 
 def _array(block: Block) -> Any:
-    return np.frombuffer(block.values, np.float64 if block.type == "Real" else np.int32)
+    return np.ctypeslib.as_array(block.values)
 
 
 def _sampled(signal: Signal, time: FloatArray) -> FloatArray:

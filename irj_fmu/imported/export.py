@@ -25,8 +25,10 @@ KINDS: Final = ("corrected", "pair", "ssp")
 _INNER: Final = "inner.fmu"
 
 
-def export_pair(model: UserModel, out: Path, *, cc: str | None = None, shim: bool = True) -> Path:
-    """Write FMU and correction as one FMI 2.0 co-simulation FMU.
+def export_pair(
+    model: UserModel, out: Path, *, cc: str | None = None, shim: bool = True, fmi: int = 2
+) -> Path:
+    """Write FMU and correction as one co-simulation FMU.
 
     It holds the user's FMU as it is, whatever its version and interface, the fitted values and the
     effect. It needs Python in the host, as the estimator does.
@@ -40,13 +42,15 @@ def export_pair(model: UserModel, out: Path, *, cc: str | None = None, shim: boo
         Compiler of the shim for C hosts.
     shim : bool
         False leaves the shim out.
+    fmi : {2, 3}
+        Version of FMI, whatever that of the FMU; FMI 3.0 needs a compiler.
 
     Raises
     ------
     InputError
         Where the FMU cannot be packed or the folder cannot be written.
     """
-    return _package(model, out, "Pair", cc=cc, shim=shim, inner=True)
+    return _package(model, out, "Pair", cc=cc, shim=shim, inner=True, fmi=fmi)
 
 
 def export_system(model: UserModel, out: Path, *, cc: str | None = None, shim: bool = True) -> Path:
@@ -100,7 +104,14 @@ def export_system(model: UserModel, out: Path, *, cc: str | None = None, shim: b
 
 
 def _package(
-    model: UserModel, out: Path, what: str, *, cc: str | None, shim: bool, inner: bool
+    model: UserModel,
+    out: Path,
+    what: str,
+    *,
+    cc: str | None,
+    shim: bool,
+    inner: bool,
+    fmi: int = 2,
 ) -> Path:
     name = identifier(Path(out).stem)
     with tempfile.TemporaryDirectory(prefix="irj-pair-") as temporary:
@@ -120,6 +131,7 @@ def _package(
             out,
             cc=cc,
             shim=shim,
+            fmi=fmi,
         ).path
 
 

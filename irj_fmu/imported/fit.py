@@ -205,14 +205,28 @@ def fit(
     given = at_least_one(records)
     if not model.values:
         raise InputError(f"{model.fmu.path.name}: no parameter to fit; name those that may move")
-    say = progress or (lambda _text, _share: None)
+    tell = progress or (lambda _text, _share: None)
+    at: list[tuple[str, float]] = []
+
+    def say(text: str, share: float) -> None:
+        at[:] = [(text, share)]
+        tell(text, share)
+
+    def column(number: int, count: int) -> None:
+        tell(f"{at[0][0]}, derivative {number} of {count}", at[0][1])
+
     windows = model.windows(given)
     say(f"taking up {model.fmu.path.name}", 0.02)
     noise = noise_of(model, given)
     model, used = coupled(model, windows, noise), 0
     for _ in range(_COUPLINGS):
         simulator, method = simulator_of(model, windows, noise, exact)
+        if isinstance(simulator, BlackBox):
+            simulator.say = column
         solver = Solver(model, windows, simulator, noise)
+        if not used and np.any(solver.relative_errors() >= 1.0):
+            _try_one_window(solver, noise, exact, iterations, say)
+            say("fitting all windows", 0.05)
         used += solver.solve(iterations, say)
         fitted = model.with_values(solver.values)
         finer = coupled(fitted, windows, noise)
@@ -241,6 +255,50 @@ def fit(
         records=tuple(given),
         settled=solver.settled,
     )
+
+
+def _try_one_window(
+    solver: Solver, noise: FloatArray, exact: bool, iterations: int, say: Progress
+) -> None:
+    """Fit the window that moves most alone: what no values fit to one window they fit to no record,
+    and all windows take as many times as long.
+
+    Raises
+    ------
+    InputError
+        Where a position or velocity that moves in the window is further off in the end than if it
+        stood still; another output may have an offset that the FMU does not know.
+    """
+    model, windows = solver.model, solver.windows
+    if len(windows) < 2:
+        return
+    moves = np.array([np.std(w.outputs, axis=0) for w in windows]) / solver.size
+    one = int(np.argmax(moves.sum(axis=1)))
+    judged = moves[one] >= moves.mean(axis=0)
+    judged &= [m.channel.endswith(("_position", "_velocity")) for m in model.outputs]
+    simulator = simulator_of(model, [windows[one]], noise, exact)[0]
+    alone = Solver(model, [windows[one]], simulator, noise)
+    say(f"fitting one of {len(windows)} windows", 0.04)
+    off, last = np.where(judged, alone.relative_errors(), 0.0), math.inf
+    for _ in range(iterations):
+        if off.max() < 1.0:
+            return
+        size = float(np.sum(np.log(alone.relative_errors())))
+        if size > last - ROUGH:  # together they fall by less than is worth a step
+            break
+        last = size
+        alone.solve(1)
+        off = np.where(judged, alone.relative_errors(), 0.0)
+    worst = int(np.argmax(off))
+    if off[worst] >= 1.0:
+        time = windows[one].time
+        raise InputError(
+            f"{model.fmu.path.name}: no values of its parameters bring "
+            f"{model.outputs[worst].channel} nearer to the record than standing still, not even "
+            f"over one window of {time[-1] - time[0]:.2g} s alone (off by {off[worst]:.2g} times "
+            "its motion): check gear_ratio, and its scale and sign in [model.channels] and "
+            "[model.start]"
+        )
 
 
 def simulator_of(
@@ -369,7 +427,14 @@ class Solver:
         self.sigma = self.size.copy()
         self.predicted = simulator.simulate(self.values, self.starts)
         self.settled = False
-        self.names = self._moving()
+        self._names: list[str] | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """Found when they are asked for: that takes a run of every window for each parameter."""
+        if self._names is None:
+            self._names = self._moving()
+        return self._names
 
     def _moving(self) -> list[str]:
         """Parameters that move an output here; a shape does not while its amplitude is 0."""
@@ -382,6 +447,19 @@ class Solver:
             for i, n in enumerate(names)
         }
         return [n for n in names if moved[n] * scale_of(self.values[n], self.bounds[n]) > _MOVED]
+
+    def relative_errors(self) -> FloatArray:
+        """RMS error of each output, in what it would be of one that stays where each window begins:
+        a model that begins there as well must be nearer to the record.
+        """
+        still = np.concatenate([w.outputs - w.outputs[:1] for w in self.windows])
+        residual = np.concatenate(
+            [w.outputs - y for w, y in zip(self.windows, self.predicted, strict=True)]
+        )
+        found: FloatArray = np.sqrt(
+            np.mean(residual**2, axis=0) / np.maximum(np.mean(still**2, axis=0), 1e-300)
+        )
+        return found
 
     def _problem(self, say: Callable[[int], None] | None = None) -> Outputs:
         return Outputs(self.windows, self.simulator, self.values, self.names, self.sigma, say)
@@ -409,7 +487,7 @@ class Solver:
                 break
             fine, self.sigma, before = kept, sigma, sigma
             if fine and len(self.names) < len(self.values):
-                self.names = self._moving()
+                self._names = self._moving()
             begun = used
 
             def tell(step: int, begun: int = begun) -> None:

@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.errors import InputError
-from irj_fmu.host.described import described, unreadable
-from irj_fmu.host.fmu import FmuError, Number, callbacks, near_names
+from irj_fmu.host.described import described, has_state_events, unreadable
+from irj_fmu.host.fmu import FmuError, Number, callbacks, logger, near_names
 from irj_fmu.host.last_free import freer
 from irj_fmu.host.signals import FloatArray
 
@@ -146,8 +146,7 @@ class UserFmu:
     @property
     def has_state_events(self) -> bool:
         """True where its model exchange jumps at events, which runs here do not look for."""
-        own = self.description
-        return bool(own.numberOfEventIndicators or len(own.eventIndicators))
+        return has_state_events(self.description)
 
     def grain(self, kind: Kind) -> float | None:
         """The fixed step of a co-simulation, of which it takes whole multiples only [s]; None where
@@ -357,7 +356,7 @@ class UserInstance:
             )
             given = (*given, ctypes.addressof(self._callbacks), 0, 0)
         else:
-            self._callbacks = _LOG3(_note(self.messages))
+            self._callbacks = _LOG3(logger(self.messages))
             token, place = (
                 str(fmu.description.instantiationToken).encode(),
                 f"{fmu.folder / 'resources'}/",
@@ -644,14 +643,6 @@ class UserInstance:
 
     def __exit__(self, *_about: object) -> None:
         self.close()
-
-
-def _note(messages: list[str]) -> Callable[[Any, int, bytes, bytes], None]:
-    def note(_environment: Any, _status: int, _category: bytes, message: bytes) -> None:
-        if len(messages) < 1000:
-            messages.append(message.decode(errors="replace"))
-
-    return note
 
 
 __all__ = ["Block", "Kind", "UserFmu", "UserInstance"]

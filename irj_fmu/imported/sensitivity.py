@@ -4,7 +4,7 @@ possible, else by differences.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Protocol, final
 
 import numpy as np
@@ -61,6 +61,11 @@ class BlackBox:
     windows : sequence of Window
     noise : (outputs,) array
         Standard deviation of the noise of each output, in its unit.
+
+    Attributes
+    ----------
+    say : callable
+        Called with number and count before each derivative: it takes a run of every window.
     """
 
     def __init__(self, model: UserModel, windows: Sequence[Window], noise: FloatArray) -> None:
@@ -69,6 +74,7 @@ class BlackBox:
         self.noise = np.maximum(np.maximum(noise, SAME * size), 1e-300)
         self._shares: dict[str | int, float] = {}
         self._least: float | None = None
+        self.say: Callable[[int, int], None] = lambda _number, _count: None
         self.runner: Runner = model.runner()
         self.runner.choose_substeps(self.windows[0], {p.name: p.value for p in model.parameters})
         self.bounds = model.bounds()
@@ -108,7 +114,8 @@ class BlackBox:
             least = [self._far(moved_by(k, SMALLEST)[0], base) for k in keys[-1:]]
             self._least = CLEAR * max(least, default=0.0)
         columns: list[list[FloatArray]] = []
-        for key in keys:
+        for number, key in enumerate(keys, 1):
+            self.say(number, len(keys))
             share = self._shares.get(key, STEP)
             moved, step = moved_by(key, share)
             far = self._far(moved, base)

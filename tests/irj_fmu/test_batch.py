@@ -28,6 +28,7 @@ from irj_fmu.batch.sampling import cases_of
 from irj_fmu.batch.store import lock
 from irj_fmu.host.run import Fmu, Instance, Wiring, simulate_cs
 from irj_fmu.host.signals import Table
+from irj_fmu.plant.fmi3 import build_plant_fmi3
 from irj_fmu.plant.joint import PlantOptions, plant_spec
 from irj_fmu.plant.library import build_plant
 from irj_fmu.plant.reference import reference_joint
@@ -585,3 +586,19 @@ def test_a_library_that_cannot_be_loaded_is_a_reason(folder: Path) -> None:
     found = run_study(write(folder, count=2), jobs=1)
     assert len(found.failed) == 2
     assert "cannot be loaded" in found.failed[0].reason
+
+
+def test_a_plant_of_fmi_3_gives_what_that_of_fmi_2_gives(plant: Path, folder: Path) -> None:
+    spec = plant_spec(reference_joint("irj_ts"), PlantOptions(name="plant"))
+    build_plant_fmi3(spec, folder / "three.fmu")
+    study = write(folder, count=2)
+    (folder / "three.toml").write_text(study.read_text().replace("plant.fmu", "three.fmu"))
+    with ThreadPoolExecutor(1) as executor:
+        run_study(study, out=folder / "two", executor=executor)
+        run_study(folder / "three.toml", out=folder / "three", executor=executor)
+    two, three = rows(folder / "two"), rows(folder / "three")
+    assert len(two) == 2 and {r["outcome"] for r in three} == {"done"}
+    figures = [k for k in two[0] if k.startswith("link_")]
+    values = [[[float(r[k] or "nan") for k in figures] for r in found] for found in (two, three)]
+    assert np.nanmax(np.abs(values[0])) > 1e-3
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-12, atol=0)

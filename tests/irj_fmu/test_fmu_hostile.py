@@ -20,6 +20,7 @@ from irj_fmu.estimator.native import NativeSpec, build_native
 from irj_fmu.estimator.native_fmi3 import build_native_fmi3
 from irj_fmu.fmi.compiler import find_compiler, header_folder
 from irj_fmu.imported.correction import PREFIX
+from irj_fmu.imported.export import export_pair
 from irj_fmu.imported.file import outside_correction
 from irj_fmu.imported.model import load_user_model
 from irj_fmu.plant.fmi3 import build_plant_fmi3
@@ -29,8 +30,9 @@ from irj_fmu.plant.reference import reference_joint
 from tests.irj_fmu.test_fmu_package import LOADER, clean_environment, pack
 
 HERE = Path(__file__).parents[1]
-OF_2 = ("plant", "native", "slave", "corrected")
-OF_3 = ("plant3", "native3", "corrected3")
+OF_2 = ("plant", "native", "slave", "corrected", "pair")
+OF_3 = ("plant3", "native3", "corrected3", "pair3")
+WITH_PYTHON = ("slave", "pair", "pair3")
 EVERY = (*OF_2, *OF_3)
 C_LIBRARY = {"libc", "libm", "libdl", "libpthread", "ld-linux-x86-64", "ld-linux-aarch64"}
 CHROOT = shutil.which("chroot")
@@ -71,16 +73,19 @@ def made(folder: Path, what: str) -> Path:
     if what in ("native", "native3"):
         spec = NativeSpec(joint, what, OnlineOptions(optimise=False), None, 1e-3)
         return build_native(spec, path) if what == "native" else build_native_fmi3(spec, path)
-    if what in ("corrected", "corrected3"):  # round a plant that gives its state
+    if what.startswith(("corrected", "pair")):  # round a plant that gives its state
         model = load_user_model(
-            made(folder, what.replace("corrected", "plant")),
+            made(folder, "plant3" if what == "corrected3" else "plant"),
             {"motor_current": "i_m", "motor_position": "motor_position"},
             joint=joint,
             kind="cs",
         )
         drag = {f"{PREFIX}motor_quadratic_drag": 0.1}
         law = outside_correction(["quadratic_drag@motor"], model.joint, drag, "here")
-        return export_corrected(replace(model, correction=law), path)
+        whole = replace(model, correction=law)
+        if what.startswith("pair"):
+            return export_pair(whole, path, fmi=3 if what in OF_3 else 2)
+        return export_corrected(whole, path)
     if what == "slave":  # the shim is that of every estimator
         return pack(folder, name=path.name).path
     plant = plant_spec(joint, PlantOptions(name=what))
@@ -110,6 +115,7 @@ def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
             description.instantiationToken,
             str(readable.valueReference),
             str(description.numberOfContinuousStates if description.modelExchange else 0),
+            f"{place / 'resources'}/",
         ]
     library = place / "binaries" / platform / f"{description.coSimulation.modelIdentifier}.so"
     return [
@@ -118,7 +124,7 @@ def command(programs: dict[int, Path], folder: Path, what: str) -> list[str]:
         (place / "resources").as_uri(),
         description.guid,
         "1",
-        str(int(what == "slave")),
+        str(int(what in WITH_PYTHON)),
         str(readable.valueReference),
     ]
 
@@ -147,7 +153,7 @@ def test_the_plant_in_model_exchange_stands_it_too(programs: dict[int, Path], fo
     not hasattr(os, "geteuid") or os.geteuid() != 0 or CHROOT is None,
     reason="a root folder of its own needs the rights of root",
 )
-@pytest.mark.parametrize("what", [w for w in EVERY if w != "slave"])
+@pytest.mark.parametrize("what", [w for w in EVERY if w not in WITH_PYTHON])
 def test_they_run_for_another_user_where_nothing_is_but_the_c_library(
     programs: dict[int, Path], folder: Path, tmp_path: Path, what: str
 ) -> None:
@@ -164,7 +170,7 @@ def test_they_run_for_another_user_where_nothing_is_but_the_c_library(
     shutil.copy(line[0], tmp_path / "probe")
     tmp_path.chmod(0o755)
     moved = ["/probe", str(own / Path(line[1]).relative_to(place))]
-    rest = line[2:] if what in OF_3 else [(own / "resources").as_uri(), *line[3:]]
+    rest = line[2:5] if what in OF_3 else [(own / "resources").as_uri(), *line[3:]]
     done = subprocess.run(
         [str(CHROOT), f"--userspec={NOBODY}:{NOBODY}", str(tmp_path), *moved, *rest],
         env={"LC_ALL": "C"},
@@ -190,7 +196,7 @@ def test_valgrind_finds_no_invalid_access(
     (tmp_path / "loader.supp").write_text(LOADER)
     python = (
         ["--undef-value-errors=no", f"--suppressions={tmp_path}/loader.supp"]
-        if what == "slave"
+        if what in WITH_PYTHON
         else ["--leak-check=full"]
     )
     done = subprocess.run(

@@ -12,13 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fmpy import read_model_description
 
 from irj_fmu.fmi.bundle_loader import missing_of
-from irj_fmu.plant.fmi3 import build_plant_fmi3
-from irj_fmu.plant.joint import PlantOptions, plant_spec
-from irj_fmu.plant.library import build_plant
 from irj_fmu.plant.reference import reference_joint
 from tests.irj_fmu.test_estimator_hosts import make
+from tests.irj_fmu.test_fmu_hostile import EVERY, made
 from tests.irj_fmu.test_fmu_package import c_host, host_command, pack  # noqa: F401
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -63,14 +62,10 @@ def run(c_host: Path, unzipped: Path, place: Path, **more: str) -> subprocess.Co
 
 
 def test_no_file_holds_a_path_of_the_builder(tmp_path: Path, place: Path) -> None:
-    spec = plant_spec(reference_joint("hd3"), PlantOptions(name="plant"))
+    """Those of a native estimator: tests/irj_fmu/description/test_native_fmi3.py."""
     estimator = make(reference_joint("hd3"), tmp_path, "estimator")
-    built = [
-        pack(place).path,
-        build_plant(spec, tmp_path / "2.fmu"),
-        build_plant_fmi3(spec, tmp_path / "3.fmu"),
-        estimator,
-    ]
+    kinds = [what for what in EVERY if not what.startswith(("slave", "native"))]
+    built = [pack(place).path, estimator, *(made(tmp_path, what) for what in kinds)]
     # the root folder is a prefix of every path, and says nothing
     mine = {
         str(p)
@@ -108,6 +103,27 @@ def test_it_runs_elsewhere_with_another_environment(
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.split()) == 3
     assert np.isfinite([float(x) for x in done.stdout.split()]).all()
+
+
+def test_a_pair_runs_elsewhere_too(c_host: Path, place: Path, environment: Path) -> None:
+    """With the FMU inside it: the host sets its input and the parameter of the effect."""
+    with zipfile.ZipFile(made(place, "pair")) as archive:
+        archive.extractall(place / "pair")
+    about = read_model_description(str(place / "pair"))
+    vr = {v.name: str(v.valueReference) for v in about.modelVariables}
+    wired = [vr[n] for n in ("i_m", "correction.motor_quadratic_drag", "motor_position")]
+    library = place / "pair" / "binaries" / "linux64" / "pair.so"
+    uri = (place / "pair" / "resources").as_uri()
+    done = subprocess.run(
+        [str(c_host), str(library), uri, about.guid, "1", "3", "0.001", *wired],
+        cwd=place,
+        env={**SYSTEM, "HOME": str(place), "IRJ_PYTHON": str(environment / "python3")},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    found = [float(x) for x in done.stdout.split()]
+    assert len(found) == 3 and np.isfinite(found).all() and len(set(found)) == 3
 
 
 def test_what_is_missing_is_said_in_one_line(c_host: Path, unzipped: Path, place: Path) -> None:

@@ -406,6 +406,7 @@ def export_parser() -> OneLineParser:
         help="corrected: platform, as linux64 or win64, or all that the FMU has (default: this "
         "machine)",
     )
+    made.add_argument("--fmi", type=int, choices=(2, 3), help="pair: version of FMI (default: 2)")
     made.add_argument("--json", metavar="FILE", help="write what was built as JSON")
     return made
 
@@ -430,6 +431,9 @@ def run_export(arguments: Namespace) -> int:
         )
     if given.target is not None and given.kind != "corrected":
         raise InputError(f"--target: goes with corrected, not with {given.kind}; leave it out")
+    if given.fmi is not None and given.kind != "pair":
+        why = "has the version of the FMU" if given.kind == "corrected" else "is of FMI 2.0"
+        raise InputError(f"--fmi: goes with pair, {given.kind} {why}; leave it out")
     model = load_user_joint(given.joint)
     name = identifier(model.joint.name)
     target = given.out / (f"{name}.ssp" if given.kind == "ssp" else f"{name}_{given.kind}.fmu")
@@ -443,9 +447,10 @@ def run_export(arguments: Namespace) -> int:
         find_compiler(None, given.cc)
     if given.kind == "corrected":
         path = export_corrected(model, target, cc=given.cc, target=given.target)
+    elif given.kind == "pair":
+        path = export_pair(model, target, cc=given.cc, fmi=given.fmi or 2)
     else:
-        make = export_pair if given.kind == "pair" else export_system
-        path = make(model, target, cc=given.cc)
+        path = export_system(model, target, cc=given.cc)
     print(path)
     write_json(given.json, {"built": [str(path)]})
     return 0

@@ -52,6 +52,15 @@ _MANY_LEVELS: Final = 1e6
 """Levels from which quantisation is not worth a word: twenty bits, below the noise of a drive."""
 
 
+def check_lost(record: Record) -> list[Finding]:
+    """Tell of channels that the file names and does not give."""
+    return [
+        Finding("warn", "lost_channel", f"{record.name}: {channel} is lost, {why}", channel)
+        for channel, why in record.provenance.lost
+        if not record.has(channel)
+    ]
+
+
 def check_nan(record: Record) -> list[Finding]:
     """Find channels with values that are not finite."""
     findings = []

@@ -13,6 +13,7 @@ from identification.data.check.channels import (
     bridged_rows,
     check_absurd,
     check_constant,
+    check_lost,
     check_nan,
     check_quantisation,
     check_saturation,
@@ -27,6 +28,7 @@ from identification.data.check.relations import (
     check_velocity,
     check_wrapped,
     measured_ratio,
+    shown_ratio,
 )
 from identification.data.check.stamps import check_sampling, check_size, check_stamps
 from identification.data.check.torque import check_torque, check_work
@@ -38,7 +40,16 @@ if TYPE_CHECKING:
 
     from identification.data.record import Record
 
-__all__ = ["SEVERITIES", "Finding", "check", "gate", "measured_ratio", "repair", "require"]
+__all__ = [
+    "SEVERITIES",
+    "Finding",
+    "check",
+    "gate",
+    "measured_ratio",
+    "repair",
+    "require",
+    "shown_ratio",
+]
 
 SHORTEST_PIECE: Final = 8
 
@@ -94,6 +105,7 @@ def check(
             findings.append(Finding("refuse", "missing_channel", message, channel))
     stamps = check_stamps(record)
     findings += stamps
+    findings += check_lost(record)
     findings += check_nan(record)
     if any(finding.severity == "refuse" for finding in stamps):
         return rank(findings)

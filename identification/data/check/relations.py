@@ -364,6 +364,24 @@ def _rigid_ratio(record: Record) -> tuple[float, float, float] | None:
     return float(found[0] / sizes[0]), doubt, correlation
 
 
+def shown_ratio(record: Record) -> tuple[float, bool] | None:
+    """Gear ratio that the positions of both sides show.
+
+    Returns
+    -------
+    (ratio, torsion taken off) or None
+        The torsion is taken off where it can be told from the motion: it moves the slope of the
+        positions by up to a percent. None where a side does not move or is not measured.
+    """
+    found = measured_ratio(record)
+    if found is None:
+        return None
+    rigid = _rigid_ratio(record)
+    if rigid is not None and rigid[2] >= _CORRELATION:
+        return rigid[0], True
+    return found[0], False
+
+
 def check_ratio(record: Record, gear_ratio: float | None) -> list[Finding]:
     """Compare the gear ratio of the joint with the one the two positions show."""
     found = measured_ratio(record)

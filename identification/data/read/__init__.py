@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from identification.data.check.gate import passed
 from identification.data.column import Column
-from identification.data.columns import choose, load_map
+from identification.data.columns import choose, load_map, recognise_quietly
 from identification.data.read._formats import open_table
 from identification.data.read._source import from_pipe, is_pipe, renamed
 from identification.data.record import Provenance, Record, channel_unit
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from identification.data.read._table import Table
 
 __all__ = ["open_table", "read"]
+
+_SHOWN: Final = 20
+"""What is left out of a file is named up to so many times."""
+_PLAINLY: Final = "save it as plain numbers, one for each sample"
 
 HASHED_BESIDE: Final = 4 << 20
 """Files longer than this are hashed in a thread of their own while they are read [bytes]."""
@@ -92,16 +96,45 @@ def _read(file: Path, place: Path, raw: Mapping[str, Any], axis: str, name: str)
     """Read the file that lies at a place."""
     with _Digest(place) as digest:
         table = open_table(place)
+        _named(raw, table.left, file)
         chosen, notes = choose(raw, table.names, table.units, axis, str(file))
         time, channels, run_notes = _load(table, chosen, axis, file)
+    lost = _lost(table, axis, channels)
+    rest = [f"{name} {why}" for name, why in table.left.items() if name not in lost]
+    left = (f"left out: {', '.join(rest[:_SHOWN])}",) if rest else ()
     provenance = Provenance(
         paths=(str(file),),
         sha256=(digest.value(),),
         reader=table.reader,
         columns=tuple(entry.describe() for entry in chosen),
-        notes=table.notes + notes + run_notes,
+        notes=table.notes + left + notes + run_notes,
+        lost=tuple((channel, f"column {name!r} {why}") for name, (channel, why) in lost.items()),
     )
     return Record.from_channels(time, channels, name=name, kind=axis, provenance=provenance)
+
+
+def _named(raw: Mapping[str, Any], left: Mapping[str, str], file: Path) -> None:
+    """Refuse a map that names what is no column of the file, with the reason."""
+    for channel, entry in raw.items():
+        name = entry.get("column") if isinstance(entry, dict) else entry
+        if isinstance(name, str) and name in left:
+            raise InputError(
+                f"{file}: [columns] {channel}: column {name!r} {left[name]}: {_PLAINLY}"
+            )
+
+
+def _lost(
+    table: Table, kind: str, channels: Mapping[str, npt.NDArray[np.float64]]
+) -> dict[str, tuple[str, str]]:
+    """What is no column of the file, but has the name of a channel that no other column gives:
+    its channel, and why.
+    """
+    found = {}
+    for name, why in table.left.items():
+        column = recognise_quietly(name, kind, table.units.get(name))
+        if column is not None and column.channel not in channels and column.channel != "time":
+            found[name] = (column.channel, f"{why}: {_PLAINLY}")
+    return found
 
 
 def _load(

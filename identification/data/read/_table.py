@@ -41,6 +41,8 @@ class Table:
         What the reader did that a user should know.
     first_row : int
         Line or row number of the first sample, as a user counts it.
+    left : mapping of str to str
+        What of the file is no column, and why: ``"holds complex numbers"``.
     """
 
     reader: str
@@ -49,6 +51,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     first_row: int = 1
+    left: Mapping[str, str] = field(default_factory=dict)
 
 
 def missing_package(module: str, extra: str, what: str, where: str) -> InputError:
@@ -93,8 +96,8 @@ def vectors(arrays: Mapping[str, Any], where: str) -> dict[str, npt.NDArray[Any]
 def from_arrays(
     reader: str, arrays: Mapping[str, Any], where: str, units: Mapping[str, str] | None = None
 ) -> Table:
-    """Make a table of arrays that are in memory; vectors of another length are left out, with a
-    note.
+    """Make a table of arrays that are in memory; what is no vector of numbers or texts, or of
+    another length than the rest, is left out, with the reason.
 
     Raises
     ------
@@ -103,17 +106,28 @@ def from_arrays(
     """
     columns = vectors(arrays, where)
     used = columns.keys() | {name.removesuffix("[0]") for name in columns}
-    left = [name for name, array in arrays.items() if name not in used and np.size(array) > 1]
-    notes = (
-        (f"left out, of another length than the rest or not numeric: {', '.join(left[:20])}",)
-        if left
-        else ()
-    )
+    common = next(iter(columns.values())).size
+    left = {
+        name: _no_column(np.asarray(array), common)
+        for name, array in arrays.items()
+        if name not in used and np.size(array) > 1
+    }
 
     def load(numeric: Sequence[str], text: Sequence[str]) -> Mapping[str, npt.NDArray[Any]]:
         return {name: columns[name] for name in (*numeric, *text)}
 
-    return Table(reader, tuple(columns), load, units or {}, notes)
+    return Table(reader, tuple(columns), load, units or {}, left=left)
+
+
+def _no_column(array: npt.NDArray[Any], common: int) -> str:
+    """Why an array is no column beside others of a length."""
+    if array.dtype.kind == "c":
+        return "holds complex numbers"
+    if array.dtype.kind not in "fiubUS":
+        return "holds neither numbers nor texts"
+    if array.ndim > 2:
+        return f"has {array.ndim} dimensions"
+    return f"has {max(array.shape, default=1)} values where the rest has {common}"
 
 
 Layout = tuple[tuple[int, ...], np.dtype[Any]]

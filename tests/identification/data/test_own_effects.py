@@ -6,14 +6,17 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from casadi_models import EFFECTS
+from casadi_models.child import trial
+from casadi_models.child.trial import EffectFileError
 from identification import load_joint
-from identification.data.own_effects import STORE
+from identification.data.own_effects import STORE, register
 from identification.errors import InputError
 from workbench.cli.main import main
 
@@ -221,3 +224,61 @@ def test_an_effect_that_names_an_unknown_one_is_refused_as_a_whole(
         capsys, "--effects", str(own), "effects"
     )
     assert KEY not in EFFECTS
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("import os; os._exit(0)", "it ends the process that runs it: exit code 0"),
+        (
+            "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)",
+            "it ends the process that runs it: SIGSEGV",
+        ),
+        ("while True: pass", "it takes more than 1.2 s"),
+        ("raise KeyboardInterrupt", "KeyboardInterrupt"),
+        (
+            OWN.replace("    return p.", "    import os; os._exit(0)\n    return p."),
+            "it ends the process that runs it: exit code 0",
+        ),
+    ],
+)
+def test_a_file_that_ends_its_process_is_one_line(
+    code: str, why: str, own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "SECONDS", 1.2 if "while" in code else trial.SECONDS)
+    own.write_text(code)
+    with pytest.raises(InputError) as refused:
+        register(own)
+    assert str(refused.value) == f"{own}: cannot be used as effects ({why})"
+
+
+def test_an_interrupt_is_the_users_only_where_it_was_pressed(own: Path) -> None:
+    """Where a file that was tried before is run at once."""
+    with pytest.raises(EffectFileError, match="KeyboardInterrupt"):
+        EFFECTS.load_code(own, b"raise KeyboardInterrupt", tried=True)
+    pressed = b"import os, signal; os.kill(os.getpid(), signal.SIGINT); [0 for _ in range(9)]"
+    with pytest.raises(KeyboardInterrupt):
+        EFFECTS.load_code(own, pressed, tried=True)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_file_is_tried_once_for_its_content(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    register(own)
+    forget()
+    monkeypatch.setattr(trial, "Child", None)  # no other process is started
+    assert register(own).keys == (KEY,)
+    monkeypatch.setattr(trial, "_GOOD", set())
+    assert register(own).keys == (KEY,)  # the machine knows it
+    with pytest.raises(TypeError, match="not callable"):
+        EFFECTS.load(own)
+
+
+def test_a_file_may_name_an_effect_of_one_that_was_loaded_before(own: Path, tmp_path: Path) -> None:
+    register(own)
+    other = tmp_path / "other.py"
+    other.write_text(OWN.replace(KEY, "other_seal").replace('("coulomb",)', f'("{KEY}",)'))
+    try:
+        assert EFFECTS.load(other) == ("other_seal",)
+    finally:
+        EFFECTS._loaded.pop(other.resolve(), None)
+        EFFECTS._effects.pop("other_seal", None)

@@ -404,6 +404,51 @@ def test_the_pair_as_one_fmu_is_the_pair_in_memory(
         assert error < (1e-9 if step == 1e-3 else 0.05 * np.abs(expected - bare).max())
 
 
+def test_what_fits_no_single_window_is_refused_before_all_of_them(folder: Path) -> None:
+    """The speed is said to run backwards."""
+    path = fmu(folder, "Axis", Make(2, CS))
+    model = load_user_model(
+        path,
+        {"motor_torque": "torque", "motor_position": "angle", "motor_velocity": "speed"},
+        ["inertia", "viscous"],
+        start=START,
+        window=0.5,
+    )
+    angle, speed = model.outputs
+    wrong = replace(model, outputs=(angle, replace(speed, scale=-1.0)))
+    record = axis(seconds=4.0)
+    record = record.with_channel(
+        "motor_velocity", np.gradient(record["motor_position"], record.time)
+    )
+    texts: list[str] = []
+    with pytest.raises(InputError, match=r"bring motor_velocity nearer .* than standing still"):
+        fit(wrong, record, progress=lambda text, _: texts.append(text))
+    assert any(text.startswith("fitting one of 8 windows") for text in texts)
+    assert not any("step" in text for text in texts)
+
+
+def test_the_pair_of_fmi_3_is_that_of_fmi_2(folder: Path, pair: UserModel) -> None:
+    from fmpy.validation import validate_fmu
+
+    time = np.arange(201) / 500
+    found = []
+    for fmi in (2, 3):
+        path = export_pair(pair, folder / f"pair of fmi {fmi}.fmu", fmi=fmi)
+        assert validate_fmu(str(path)) == []
+        with Fmu(path) as built, Instance(built, name="pair") as instance:
+            assert built.version == fmi
+            wiring = Wiring(
+                inputs={"pair.torque": Table(time, 5 * np.sin(40 * time))},
+                record=["pair.angle", "pair.health", "pair.n_samples"],
+                parameters={"pair.q": 0.1, "pair.viscous": 0.8},
+            )
+            for _ in range(2):  # a second run after a reset
+                run = simulate_cs(instance, wiring, step=2e-3, stop=0.4)
+            found.append(np.column_stack([run[n] for n in wiring.record]))
+    assert np.ptp(found[0], axis=0).tolist()[1] == 0 and np.ptp(found[0][:, 0]) > 1e-3
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-12, atol=0)
+
+
 def test_the_pair_as_a_system_opens_in_fmpy(folder: Path, pair: UserModel) -> None:
     from fmpy.ssp.ssd import read_ssd
 

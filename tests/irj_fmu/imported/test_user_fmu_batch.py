@@ -7,10 +7,12 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from irj_fmu.batch.fit_worker import answered
 from irj_fmu.batch.fits import fingerprint, load_fit_study, parcel_of, run_fits
+from irj_fmu.batch.run import run_study
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint, user_joint_text
 from tests.irj_fmu.imported.test_user_fmu import FILE
@@ -166,6 +168,29 @@ def test_a_study_runs_the_fmu_as_its_joint_file_says(place: Path) -> None:
         assert fits[name, "0.5"] < fits[name, "0.7"] - 5.0
 
 
+@pytest.mark.parametrize(("version", "kind"), [(2, ME), (3, CS), (3, ME)])
+def test_a_study_runs_any_version_and_interface(
+    place: Path, version: int, kind: tuple[str, ...]
+) -> None:
+    """The errors against the record are those of FMI 2.0 co-simulation: to rounding, by model
+    exchange to its integrator of fixed steps.
+    """
+    (place / "files" / "user.toml").replace(place / "files" / "fitted.toml")
+    write_record(axis(seconds=1.0), place / "run0.npz")
+    study = place / "runs.toml"
+    study.write_text(RUNS.replace(', "run1.npz"', "").replace("0.5, ", ""))
+    values = {}
+    for name, make in (("two", Make(2, CS)), ("other", Make(version, kind))):
+        build("Axis", place / "files", make).replace(place / "files" / "axis ö.fmu")
+        out = place / name
+        run_study(study, out=out, executor=Here())
+        found = rows(out / "summary.csv")
+        assert {r["outcome"] for r in found} == {"done"}
+        values[name] = [[float(r[f"angle.{k}"]) for k in ("rms", "fit_percent")] for r in found]
+    exact = 1e-12 if kind == CS else 1e-3
+    np.testing.assert_allclose(values["other"], values["two"], rtol=exact)
+
+
 def test_an_effect_outside_runs_as_the_corrected_fmu(place: Path) -> None:
     drag = 0.15
     for k in range(2):
@@ -190,7 +215,7 @@ def test_an_effect_outside_runs_as_the_corrected_fmu(place: Path) -> None:
     [
         ('kind = "estimator"', Make(2, CS), "take kind"),
         ('add = ["stribeck@motor"]', Make(2, CS), "take add out"),
-        ("", Make(2, ME), "has no co-simulation"),
+        ("", Make(2, ME, events=1), "model exchange with state events only"),
     ],
 )
 def test_what_a_study_cannot_run_is_refused(

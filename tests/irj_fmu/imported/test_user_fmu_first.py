@@ -11,7 +11,7 @@ import pytest
 from identification.data.joint_file import Joint
 from identification.data.record import Record
 from identification.errors import InputError
-from irj_fmu.first_joint import first_joint
+from irj_fmu.first_joint import _ratio, first_joint
 from irj_fmu.imported.compare import compare
 from irj_fmu.imported.file import load_user_joint
 from irj_fmu.imported.fit import fit
@@ -75,6 +75,26 @@ def test_both_sides_are_mapped_and_the_gear_ratio_is_read_off(tmp_path: Path) ->
         found = {(m.channel, m.variable, m.scale) for m in getattr(model, kind)}
         assert found == {(m.channel, m.variable, m.scale) for m in getattr(wanted, kind)}, kind
     assert set(model.values) == set(wanted.values)
+
+
+def test_the_torsion_of_a_soft_gear_is_taken_off_the_gear_ratio() -> None:
+    """It moves the slope of the positions by half a percent, from -160 to a ratio of no teeth."""
+    time = np.arange(2000) / 500
+    link = 0.6 * np.sin(2 * time) + 0.2 * np.sin(5 * time)
+    torque = 300.0 * np.sin(link) - 8.0 * (np.gradient(np.gradient(link, time), time))
+    record = Record.from_channels(
+        time,
+        {
+            "link_position": link,
+            "link_torque": torque,
+            "motor_position": -160.0 * (link - torque / 6e4),
+        },
+        name="soft",
+    )
+    rough = float(np.polyfit(link, record["motor_position"], 1)[0])
+    assert abs(rough + 160.0) > 0.5
+    ratio, why = _ratio(record, None)
+    assert ratio == -160.0 and "torsion taken off" in why
 
 
 def test_degrees_and_a_current(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ do, exit code 2, nothing printed and no file changed or left.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -17,6 +18,8 @@ import pytest
 from casadi_models import EFFECTS
 from identification.crash import FOLDER
 from identification.data.own_effects import STORE
+from identification.data.read import read
+from identification.errors import InputError
 from tests.workbench.hostile.test_hostile import EFFECT, JOINT, RETURN, refused
 from tests.workbench.test_bad_input import good
 from workbench.cli.main import main
@@ -274,6 +277,8 @@ def _tables() -> dict[str, dict[str, np.ndarray]]:
         "tiny": {**whole, "link_torque_Nm": torque * 1e-200},
         "parted": {n: (x + rows // 8 if n == "time_s" else x)[:800] for n, x in whole.items()},
         "unequal": {**whole, "link_torque_Nm": torque[:-7]},
+        "complex": {**whole, "link_torque_Nm": torque + 1j},
+        "spare": {**whole, "spare": torque + 1j},
     }
 
 
@@ -346,10 +351,31 @@ def test_a_torque_that_is_next_to_nothing_is_doubted(capsys: pytest.CaptureFixtu
     assert "warn: tiny: the drive torque from motor_current is" in capsys.readouterr().out
 
 
-def test_a_channel_that_is_left_out_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", "unequal.npz"]) == 0
+@pytest.mark.parametrize(
+    ("record", "why"),
+    [
+        ("unequal", "has {} values where the rest has {}"),
+        ("complex", "holds complex numbers"),
+    ],
+)
+def test_a_channel_that_is_lost_is_a_warning_with_its_cause(
+    record: str, why: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = len(good()["time_s"])
+    assert main(["check", f"{record}.npz"]) == 0
     out = capsys.readouterr().out
-    assert "note: left out, of another length than the rest or not numeric: link_torque_Nm" in out
+    why = why.format(count - 7, count)
+    said = f"column 'link_torque_Nm' {why}: save it as plain numbers, one for each sample"
+    assert f"  warn: {record}: link_torque is lost, {said}\n" in out
+    with pytest.raises(InputError, match=re.escape(f"[columns] link_torque: {said}")):
+        read(f"{record}.npz", columns={"link_torque": "link_torque_Nm"})
+
+
+def test_what_is_no_column_of_a_known_name_is_a_note(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "spare.npz"]) == 0
+    out = capsys.readouterr().out
+    assert "  note: left out: spare holds complex numbers\n" in out
+    assert "is lost" not in out
 
 
 STREAMS = {

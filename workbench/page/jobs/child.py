@@ -128,7 +128,7 @@ def main(pipe: Connection, folder: Path, files: Sequence[EffectFile]) -> None:
     known = {f.sha256 for f in EFFECTS.files}
     for file in files:
         if file.sha256 not in known:
-            EFFECTS.load_code(file.path, file.code)
+            EFFECTS.load_code(file.path, file.code, tried=True)
     place = Place(Session(folder), State())
     while True:
         try:
