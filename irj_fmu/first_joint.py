@@ -126,7 +126,8 @@ def _ratio(record: Record, joint: Joint | None) -> tuple[float, str]:
         return joint.gear_ratio, "as given"
     shown = shown_ratio(record)
     if shown is None:
-        one = "only one side is recorded or moves"
+        both = record.has("motor_position") and record.has("link_position")
+        one = "one side does not move" if both else "one side is recorded"
         return 1.0, f"CHECK: {one}; 1 where the FMU and the record are of one side"
     slope, bare = shown
     near = round(slope)

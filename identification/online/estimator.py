@@ -607,9 +607,7 @@ class OnlineEstimator:
             else worst(missing, detector, self.watch)
         )
         if not found and self.estimator is not None and self.is_fitted:
-            # residuals over their noise are no chance, and sigma knows nothing of them
-            unsure = self.sigma * max(1.0, float(self.ratio.max()))
-            found = implausible(self.names, self.theta, unsure, self.joint.fitted)
+            found = implausible(self.names, self.theta, self.sigma, self.joint.fitted)
         found = found or alarm or (HELD if self.guard.on_probation else NONE)
         if found != self.fault and found:
             self._tell(f"fault {found}")

@@ -234,11 +234,9 @@ static int plant_verdict(const Fault *f) {
 }
 
 static int implausible(const State *s) { /* an inertia far from that of the fitted joint: a wrong scale of torque or current */
-    double over = 1; /* residuals over their noise are no chance: what they make of a value is not in its sigma */
     int i;
-    for (i = 0; i < N_BALANCES; i++) over = fmax(over, s->ratio[i]);
     for (i = 0; i < N_INERTIAS; i++) {
-        const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]] * over;
+        const double before = inertia_before[i], now = s->theta[inertia_theta[i]], spread = s->sigma[inertia_theta[i]];
         if (!(before / WRONG_SCALE < now && now < WRONG_SCALE * before) && fabs(now - before) > WRONG_SIGMAS * spread) return inertia_code[i];
     }
     return 0;
