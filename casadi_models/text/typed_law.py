@@ -640,7 +640,7 @@ def _effect_of(law: TypedLaw) -> Effect:
     try:
         tree = parse(law.text)
     except LawError as error:
-        raise LawError(f"the text is no law: {error}") from None
+        raise LawError(f"{error}; the text is no law") from None
     parameters = _declared(law.parameters)
     _known_names(tree, places, parameters)
     _checked_units(tree, law, places, parameters)

@@ -143,7 +143,10 @@ def run_batch(arguments: Namespace) -> int:
     """`irj batch`."""
     for word in arguments.rest[:1]:  # what follows may be a result
         if word.endswith(".toml") and _is_joint(Path(word)):
-            raise InputError(f"{word}: is a joint file; a study has [study] (docs/batch.md)")
+            raise InputError(
+                f"{word}: unknown key 'joint': this is a joint file; a study has [study] "
+                "(docs/batch.md)"
+            )
     return _passed("irj_fmu.batch.run", arguments)
 
 

@@ -66,7 +66,7 @@ def test_where_nothing_is_near_it_says_what_the_joint_is(
 
 
 def test_a_joint_file_is_no_study(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "is a joint file; a study has [study]" in said(capsys, "batch", JOINT)
+    assert "this is a joint file; a study has [study]" in said(capsys, "batch", JOINT)
 
 
 def test_help_lists_every_kind_of_export(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,8 +95,8 @@ def test_names_may_follow_a_library_and_a_folder_may_hold_the_published_table(
 @pytest.mark.parametrize(
     ("law", "why"),
     [
-        ("__import__('os')", "the text is no law: column 1: the sign '_' has no place"),
-        ("a*(", "the text is no law: column 4: the law ends where a value is expected"),
+        ("__import__('os')", "column 1: the sign '_' has no place"),
+        ("a*(", "column 4: the law ends where a value is expected; the text is no law"),
     ],
 )
 def test_a_text_that_is_no_law_is_called_so(
