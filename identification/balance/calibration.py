@@ -118,6 +118,13 @@ def unknowns_of(model: JointModel, sensing: Sensing) -> tuple[str, ...]:
     return _without_named(model, tuple(n for n, is_there in there.items() if is_there))
 
 
+def nuisances(model: JointModel) -> frozenset[str]:
+    """Parameters that are no figure of the joint: stand-ins for jumps, the hold of the drive, and
+    what the sensors were off by.
+    """
+    return frozenset({*model.named("smoothing"), HOLD_NAME, *model.calibration})
+
+
 def named_late(model: JointModel) -> JointModel:
     """The model without the skews of channels whose delay it names."""
     return replace(model, calibration=_without_named(model, model.calibration))

@@ -16,7 +16,13 @@ from casadi_models import JointModel
 from casadi_models.hold import CLOCKS
 from casadi_models.term import HANGING, LOAD_COMPLIANCE, LOAD_DAMPING
 from identification.balance.balances import Balances, balances_of
-from identification.balance.calibration import bare, is_of_run, names_of_runs, usual
+from identification.balance.calibration import (
+    bare,
+    is_of_run,
+    names_of_runs,
+    nuisances,
+    usual,
+)
 from identification.balance.dataset import (
     HOLD_NAME,
     Dataset,
@@ -664,7 +670,7 @@ def _with_errors(
             ):
                 unidentified.append(free[i])
         if size is not None:
-            apart = {*smoothing, HOLD_NAME, *balances.model.calibration}
+            apart = nuisances(balances.model)
             told = [k for k, i in enumerate(index.tolist()) if bare([free[i]])[0] not in apart]
             names = [free[index[k]] for k in told]
             alone = spread / np.sqrt(np.maximum(np.diag(part.gram), 1e-300)) / norms[index]

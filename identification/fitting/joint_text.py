@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from identification.balance.calibration import Found, calibration_found
-from identification.balance.dataset import HOLD_DELAY, HOLD_NAME, Dataset
+from identification.balance.calibration import Found, calibration_found, nuisances
+from identification.balance.dataset import HOLD_DELAY, Dataset
 from identification.data.joint_file import Joint, Standing, toml_text
 from identification.fitting.assess import BalanceError, assess
 from identification.fitting.engine import Solution
@@ -37,7 +37,7 @@ def standing_of(
     """
     if left is None:
         left = assess(solution.model, data, data.train, solution.values).balances
-    nuisance = {*solution.model.named("smoothing"), HOLD_NAME, *solution.model.calibration}
+    nuisance = nuisances(solution.model)
     on = resting(solution, data)
     return {
         b: Standing(e.ratio, tuple(n for n in on.get(b, ()) if n not in nuisance))

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.parameter import Parameter
 from identification.balance.balances import balances_of
-from identification.balance.calibration import bare
-from identification.balance.dataset import HOLD_NAME, Dataset
+from identification.balance.calibration import bare, nuisances
+from identification.balance.dataset import Dataset
 from identification.balance.stacked import references, taking_part
 from identification.balance.weak import INDEPENDENT_SHARE
 from identification.data.formats import number, words
@@ -257,7 +257,6 @@ class _Judge:
     def __init__(self, solution: Solution, data: Dataset) -> None:
         self.solution, self.data = solution, data
         self.model = solution.model
-        smoothing = self.model.named("smoothing")
         self.moving = tuple(n for n in solution.free if n not in solution.at_bound)
         self.form = form_of(solution, data, self.moving, solution.weights)
         x = np.array([self.form.values[n] for n in self.form.free])
@@ -295,7 +294,7 @@ class _Judge:
             spread = correlations(self.gram)[1]
             sizes = np.where(np.isfinite(self.white), self.white, 0.0)
             self.together = Correlation.of(self.moving, spread, sizes)
-        self.nuisance = {*smoothing, HOLD_NAME, *self.model.calibration}
+        self.nuisance = nuisances(self.model)
         self.limits = bounds_of(self.model, data.joint.known, data)
 
     def all(self, *, profiles: bool) -> Trust:
@@ -510,7 +509,7 @@ def trusted_file(joint: Joint) -> Trust:
             f"{joint.source or joint.name}: has no fitted values with standard errors; give the "
             "records too, or fit it first (irj fit -o)"
         )
-    nuisance = {*model.named("smoothing"), HOLD_NAME, *model.calibration}
+    nuisance = nuisances(model)
     told = [p for p in model.parameters if p.name in joint.fitted and p.name not in nuisance]
     names = [p.name for p in told]
     together = joint.correlation.matrix(names)

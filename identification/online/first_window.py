@@ -150,7 +150,8 @@ def told_beside_noise(
     -------
     y and h of what counts, and the mean squares at the end, (balances, parameters)
     """
-    hides, rate = Settings.shown_over * noise, min(1.0, period / Settings.shown_seconds)
+    settings = Settings(sample_time=period)
+    hides, rate = settings.shown_over * noise, settings.shown_rate
     told, square = np.empty(h.shape, dtype=np.bool_), h[0] ** 2
     for k, row in enumerate(h):
         square = square + rate * (row**2 - square)

@@ -300,9 +300,7 @@ class RecursiveLeastSquares:
         )
         engine.part("config", "noise_known")[:] = 1.0
 
-    def set_entry_noise(
-        self, variance: npt.ArrayLike, square: npt.ArrayLike | None = None
-    ) -> None:
+    def set_entry_noise(self, variance: npt.ArrayLike, square: npt.ArrayLike | None = None) -> None:
         """New variances of the noise that entries of H themselves have, shape (outputs,
         parameters), user units squared; zero, as at the start, where an entry is exact.
 

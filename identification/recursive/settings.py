@@ -126,6 +126,11 @@ class Settings:
     shown_over: float = 30.0
     shown_seconds: float = 0.25
 
+    @property
+    def shown_rate(self) -> float:
+        """Share by which a sample moves the mean squares of the entries of H."""
+        return min(1.0, self.sample_time / self.shown_seconds)
+
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
         for field in fields(self):
@@ -394,7 +399,7 @@ def fill_config(
     config[at["clear_info"]] = settings.clear_amplitude**2
     config[at["inflation"]] = settings.inflation or 0.0
     config[at["huber"]] = settings.huber or 1e30
-    config[at["shown_rate"]] = min(1.0, step / settings.shown_seconds)
+    config[at["shown_rate"]] = settings.shown_rate
     config[at["decay"]] = math.exp(-config[at["check_length"]][0] / (1000.0 * block))
     return config
 

@@ -12,8 +12,8 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from casadi_models.term import Term
 from identification.balance.balances import balances_of
-from identification.balance.calibration import settled
-from identification.balance.dataset import HOLD_NAME, Dataset, visible_labels, without
+from identification.balance.calibration import nuisances, settled
+from identification.balance.dataset import Dataset, visible_labels, without
 from identification.balance.stacked import (
     passed_on,
     references,
@@ -128,7 +128,7 @@ class Refit:
     def parameters(self) -> int:
         """Free parameters, without nuisances."""
         model = self.solution.model
-        aside = {HOLD_NAME, *model.named("smoothing"), *model.calibration}
+        aside = nuisances(model)
         return sum(n not in aside for n in self.solution.free)
 
     @property

@@ -351,7 +351,7 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     for name in ("RANGE", "PASSES", "DEVIATION"):
         header.define(f"FIRST_{name}", getattr(first_window, name))
     header.define("SHOWN_OVER", float(Settings.shown_over))
-    header.define("SHOWN_RATE", min(1.0, period / Settings.shown_seconds))
+    header.define("SHOWN_RATE", Settings(sample_time=period).shown_rate)
     told = ("d", "u", "theta", "noise", "error", "learned", "alarm", "due", "size")
     tuned = ("scale", "theta0", "walk", "walk_alarm", "enabled", "start", "hides")
     for name, block, parts in (

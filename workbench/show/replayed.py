@@ -31,9 +31,9 @@ UNFITTED: Final = (
     "(`irj fit -o`)"
 )
 UNMEASURED: Final = (
-    "sensor faults were not looked for: the velocities are derived, and their noise looks like a "
-    "failure until records of the healthy joint are given with --healthy, each run a file of its "
-    "own"
+    "sensor faults were not looked for with the model: the velocities are derived, and their noise "
+    "looks like a failure until records of the healthy joint are given with --healthy, each run a "
+    "file of its own"
 )
 
 READINGS: Final = (
