@@ -499,7 +499,9 @@ def swept(model: Structure, symbols: Symbols) -> tuple[Expression, Expression]:
         slope = ca.jacobian(t.effect.law(builder.local(t, own, rate), values), rate)
         straight, bent = affine.split(builder.turned(own))
         if not (slope.is_zero() or bent.is_zero() or ca.depends_on(slope, varying)):
-            now = sum((by * getattr(raw, _RATES[names[i]]) for i, by in straight.items()), _zero())
+            rates = ((by, _RATES.get(names[i])) for i, by in straight.items())
+            # the rate of a rate times a skew is of second order, as in `torsion_rate`
+            now = sum((by * getattr(raw, rate) for by, rate in rates if rate), _zero())
             moved = moved + slope * bent
         still = still + t.effect.law(builder.local(t, own, now), values)
     return still, moved

@@ -8,17 +8,17 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, final
+from typing import Any, Final, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
 
-from casadi_models.hold import CLOCKS
-from identification.balance.clocks import MOST_SKEW
+from casadi_models.hold import CLOCKS, UNKNOWNS
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import ABSURD
 from identification.linear.triangle import single_thread
+from identification.online.calibration import ROUNDS, Calibration
 from identification.online.first_window import (
     fast_recursion,
     first_estimate,
@@ -36,9 +36,10 @@ from identification.online.options import (
 )
 from identification.online.pulse import GAP, Pulse
 from identification.online.row_check import LEAST, RowCheck
-from identification.online.rows import RowMaker
+from identification.online.rows import SOURCES, RowMaker
 from identification.online.samples import Samples
 from identification.online.state import Sample, State, joined, pack, parted, unpack
+from identification.online.timing import Alignment
 from identification.online.two_step import Reoptimiser, make_two_step
 from identification.online.verdict import (
     FAULT_TEXT,
@@ -51,6 +52,7 @@ from identification.online.verdict import (
 )
 from identification.online.watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
 from identification.recursive.estimator import RecursiveLeastSquares, Settings
+from identification.recursive.prior_start import PriorStart
 from identification.two_step.algorithm import OnlineSettings
 
 FloatArray = npt.NDArray[np.float64]
@@ -74,6 +76,17 @@ def _own(arrays: dict[str, FloatArray], prefix: str) -> dict[str, FloatArray]:
         for name, values in arrays.items()
         if name.startswith(prefix)
     }
+
+
+class _Start(NamedTuple):
+    """A recursion that may be gone on with, and the weighted rows that it began with."""
+
+    recursion: RecursiveLeastSquares
+    found: PriorStart
+    y: FloatArray
+    h: FloatArray
+    least: FloatArray
+    torque: FloatArray
 
 
 @final
@@ -125,14 +138,15 @@ class OnlineEstimator:
         self.needs = [False] * len(self.present)
         for k, reading in enumerate(SAMPLED):
             self.needs[reading] = used[k] and self.present[reading]
-        self.samples = Samples(self.rows.timing, self.needs, self.rows.alignment)
+        self.calibration = Calibration(self.model, self.names, dt)
+        self.samples = Samples(self.rows.timing, self.needs, self._alignment())
         self.watch = Watch(dt, self.present)
         self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}
         start = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
         self.held_stiffness = start.get(self.model.stiffness_name or "", 0.0)
-        own |= dict.fromkeys(CLOCKS, (-MOST_SKEW * dt, MOST_SKEW * dt))
+        own |= dict.fromkeys(CLOCKS, (-self.calibration.most, self.calibration.most))
         self.low = np.array([min(own[n][0], start[n]) for n in self.names])
         self.high = np.array([max(own[n][1], start[n]) for n in self.names])
         self._margin = 1.0
@@ -189,6 +203,7 @@ class OnlineEstimator:
         """Before the first sample."""
         self.rows = self._plain_rows
         self.rows.reset()
+        self.calibration.reset()
         self.watch.reset()
         self.pulse.reset()
         self.grid.reset()
@@ -197,12 +212,24 @@ class OnlineEstimator:
             self.two_step.reset()
         if self.detector is not None:
             self.detector.reset()
-        self.samples.reset()
+        self._align()
         self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        self._heard: list[tuple[float, float, float, float]] = []
+        self._told_rows: list[tuple[BoolArray, bool]] = []
         self.estimator: RecursiveLeastSquares | None = None
         values = dict(zip(self.model.parameter_names, self.model.value_vector(), strict=True))
         theta = np.array([values[name] for name in self.names])
         self._sampled, self._now = Sample.first(), State.first(theta, len(self.balances))
+
+    def _alignment(self) -> Alignment:
+        found = self.calibration.late if self.calibration.skews else None
+        return Alignment.of(self.model, SOURCES, self.dt, found)
+
+    def _align(self) -> None:
+        """Free the readings to come of what is found of their sensors."""
+        self.samples.align(self._alignment(), self.calibration.zero)
+        for rows in (self._plain_rows, *(() if self.two_step is None else (self.two_step.rows,))):
+            rows.off[:] = self.calibration.off
 
     def _set(self, **changes: Any) -> None:
         """Go on to the next state."""
@@ -274,7 +301,12 @@ class OnlineEstimator:
     @property
     def is_fitted(self) -> bool:
         """True where the joint file has a value for every estimated parameter."""
-        return all(n in self.joint.fitted or n in CLOCKS for n in self.names)
+        return all(n in self.joint.fitted or n in UNKNOWNS for n in self.names)
+
+    @property
+    def has_values(self) -> bool:
+        """True where the joint file has a value for every parameter of the model."""
+        return not self.joint.lacks(self.model)
 
     @property
     def held(self) -> bool:
@@ -381,7 +413,9 @@ class OnlineEstimator:
         since = self._sampled.since + 1
         self._sampled = Sample(since % self.rows.timing.stride, used, shown)
         q = used
-        self.samples.add((q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE]))
+        sample = (q[Q_M], q[Q_L] if self.present[Q_L] else q[Q_M], q[TAU], q[DRIVE])
+        self.samples.add(sample)
+        self._hear(sample)
         self.samples.mark(
             good if counts else [False] * 6, failed, self.watch, whole=counts and good is self._all
         )
@@ -394,6 +428,20 @@ class OnlineEstimator:
         if self.two_step is not None and self.two_step.searching and enable:
             self._advance(self.two_step)
         return made
+
+    def room_of(self, rows: int) -> int:
+        """Samples to keep where a first window has so many rows: a quarter may be missing."""
+        return self.rows.timing.stride * (rows + rows // 4 + self.rows.rows_before_ready)
+
+    def _hear(self, sample: tuple[float, float, float, float]) -> None:
+        """Keep the readings of the first window, as far as there is room: to make its rows again
+        where the sensors are off.
+        """
+        if self.estimator is not None or not self.calibration or self._now.rows and not self._heard:
+            return
+        self._heard.append(sample)
+        if len(self._heard) > self.room_of(self.collect):
+            self._heard, self._told_rows = [], []
 
     def _detect(
         self, readings: list[float], good: list[bool], used: list[float]
@@ -426,24 +474,23 @@ class OnlineEstimator:
 
     def _row(self, time: float, enable: bool) -> bool:
         found = self.rows.make(self.samples.window, time - self.samples.lag)
+        on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
+        told = on, enable and bool(on.all())
+        if self._heard:
+            self._told_rows.append(told)
         if found is None:
             return False
         y, h = found
         rows = self._now.rows + 1
-        on: BoolArray = ~np.any(self.rows.uses & self.samples.lost, axis=1)
+        if self.estimator is None:
+            self._set(rows=rows)
+            self._collect(y, h, told)
+            if told[1] and len(self._collected) >= self.collect:
+                self._begin(time)
+            return True
         shares = self._shares()
         if self.two_step is not None:
             self.two_step.keep(self.rows.new_points, self.rows.signals, shares, on)
-        if self.estimator is None:
-            self._set(rows=rows)
-            if enable and on.all():
-                self._collected.append((y, h, shares))
-                power = self.rows.signals[self.reference] ** 2
-                self._set(torque=self._now.torque + power)
-                if len(self._collected) >= self.collect:
-                    with single_thread():
-                        self._begin()
-            return True
         check = self.check
         check(
             *(
@@ -514,32 +561,92 @@ class OnlineEstimator:
         """
         return self.check.weights(shares, theta, size)
 
-    def _begin(self) -> None:
+    def _begin(self, time: float) -> None:
         """Start the recursion from the collected rows."""
+        with single_thread():
+            started = self._started()
+            for held in (True, False) if self._heard else ():
+                if held and not (self.calibration.zeros and self.has_values):
+                    continue
+                for _ in range(ROUNDS):
+                    if not self._takes(started, held=held):
+                        break
+                    self._make_again(time)
+                    started = self._started()
+            self._take_up(started)
+
+    def _started(self) -> _Start:
+        """A recursion from the collected rows."""
         y, h, shares = (np.array([row[i] for row in self._collected]) for i in range(3))
-        self._set(torque=self._now.torque / len(y))
-        period, noise = self.rows.timing.stride * self.dt, self._entry_noise()
+        torque, period = self._now.torque / len(y), self.rows.timing.stride * self.dt
+        noise = self._entry_noise()
         y, h, entries = told_beside_noise(y, h, self.theta, noise, period)
-        least = np.maximum(self.options.floor_share * np.sqrt(self._now.torque), LEAST)
+        least = np.maximum(self.options.floor_share * np.sqrt(torque), LEAST)
         first, weight = first_estimate(
             y, h, least, self.rows.like, partial(self._weight_of, shares)
         )
         least = np.maximum(least, self.rows.floor(first.tolist(), self.watch.noise[list(SAMPLED)]))
         y, h = y * weight, h * weight[:, :, None]
         self._set(scale=prior_range(first, self.theta, h, y, self.rows.usual, self.rows.like))
-        self.estimator = self.recursion(self.theta)
-        started = self.estimator.begin(y, h, least, overlap=self.rows.timing.overlap)
-        self.estimator.set_entry_noise(noise, entries)
-        if started.undetermined:
-            names = ", ".join(self.names[i] for i in started.undetermined)
-            self._tell(f"not determined by the first window: {names}")
-        theta = self._within(self.estimator.theta)
-        square = np.mean((y - h @ theta) ** 2, axis=0)
-        self._set(theta=theta, sigma=self.estimator.deviation, square=square)
+        recursion = self.recursion(self.theta)
+        found = recursion.begin(y, h, least, overlap=self.rows.timing.overlap)
+        recursion.set_entry_noise(noise, entries)
+        return _Start(recursion, found, y, h, least, torque)
+
+    def _takes(self, start: _Start, *, held: bool) -> bool:
+        """Take what the window tells of the sensors off their readings; False where that is too
+        little.
+        """
+        own, told = self.calibration, (start.recursion.theta, start.recursion.deviation)
+        if held:
+            noise = self.rows.timing.overlap * start.found.noise
+            told = own.held(start.y, start.h, self.theta, noise, self.rows.usual)
+        return own.take(*told, own.small(start.h, start.least))
+
+    def _make_again(self, time: float) -> None:
+        """Make the collected rows again, the readings freed of what the sensors are off by."""
+        self._align()
+        self.rows.reset()
+        if self.two_step is not None:
+            self.two_step.reset()
         self._collected = []
+        self._set(torque=np.zeros(len(self.balances)))
+        stride, last = self.rows.timing.stride, len(self._heard) - 1
+        for k, sample in enumerate(self._heard):
+            self.samples.add(sample)
+            if k % stride == stride - 1:
+                at = time - (last - k) * self.dt - self.samples.lag
+                found = self.rows.make(self.samples.window, at)
+                if found is not None:
+                    self._collect(*found, self._told_rows[k // stride])
+
+    def _collect(self, y: FloatArray, h: FloatArray, told: tuple[BoolArray, bool]) -> None:
+        """Keep a row of the first window, where it counts."""
+        shares, (on, counts) = self._shares(), told
+        if self.two_step is not None:
+            self.two_step.keep(self.rows.new_points, self.rows.signals, shares, on)
+        if counts:
+            self._collected.append((y, h, shares))
+            self._set(torque=self._now.torque + self.rows.signals[self.reference] ** 2)
+
+    def _take_up(self, start: _Start) -> None:
+        """Go on with a recursion."""
+        self.estimator = start.recursion
+        off = ", ".join(
+            f"{self.names[i]} {value:.3g}" for i, value in enumerate(self.calibration.off) if value
+        )
+        if off:
+            self._tell(f"taken off the readings: {off}")
+        if start.found.undetermined:
+            names = ", ".join(self.names[i] for i in start.found.undetermined)
+            self._tell(f"not determined by the first window: {names}")
+        theta = self._within(start.recursion.theta)
+        square = np.mean((start.y - start.h @ theta) ** 2, axis=0)
+        self._set(theta=theta, sigma=start.recursion.deviation, square=square, torque=start.torque)
+        self._collected, self._heard, self._told_rows = [], [], []
         self._floors()
         self._set(level=np.sqrt(square))
-        self.guard.start(self.estimator)
+        self.guard.start(start.recursion)
         if self.two_step is not None and not self.two_step.known:
             self._launch(self.two_step, first=True)
 
@@ -621,6 +728,12 @@ class OnlineEstimator:
         """
         plain, arrays = parted(self._sampled, self._now)
         arrays["watch"] = self.watch.numbers()
+        arrays["off"] = self.calibration.off
+        if self._heard:
+            arrays["heard"] = np.array(self._heard)
+            arrays["told"] = np.array(
+                [[*on, counts] for on, counts in self._told_rows], dtype=float
+            )
         plain["samples"], arrays["samples"] = self.samples.state()
         if self._collected:
             arrays |= {
@@ -663,6 +776,11 @@ class OnlineEstimator:
             )
         self._sampled, self._now = joined(Sample, plain, arrays), joined(State, plain, arrays)
         self.watch.load(arrays["watch"])
+        self.calibration.off = arrays["off"].copy()
+        self._align()
+        heard, told = (arrays.get(n, np.zeros((0, 1))) for n in ("heard", "told"))
+        self._heard = list(map(tuple, heard.tolist()))
+        self._told_rows = [(row[:-1] > 0, bool(row[-1])) for row in told]
         self.samples.restore(plain["samples"], arrays["samples"])
         self._collected = (
             list(zip(arrays["y"], arrays["h"], arrays["shares"], strict=True))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, final
 
 from casadi_models import JointModel
-from casadi_models.hold import HOLD_DELAY
+from casadi_models.hold import CLOCKS, HOLD_DELAY
+from identification.balance.calibration import unknowns_of
 from identification.balance.sensing import Sensing, adapt
 from identification.data.joint_file import Joint
 from identification.errors import InputError
@@ -88,7 +89,8 @@ def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]
     """The joint's model adapted to its sensors, known values filled in.
 
     A current is commanded and held, so that its reading is early by part of a sample: the model has
-    the same freedom as in a fit (:func:`identification.balance.dataset.prepared_model`).
+    the same freedom as in a fit (:func:`identification.balance.dataset.prepared_model`), and the
+    same unknowns of the sensors.
     """
     model = joint.model()
     sensing = sensing_of(model, options)
@@ -100,7 +102,10 @@ def prepared(joint: Joint, options: OnlineOptions) -> tuple[JointModel, Sensing]
         for k, v in joint.known.items()
         if v.value is not None and k in model.parameter_names
     }
-    return model.with_values(known), sensing
+    own = unknowns_of(model, sensing)
+    if joint.lacks(model):  # derivatives at values that are none tell no clock
+        own = tuple(n for n in own if n not in CLOCKS)
+    return replace(model.with_values(known), calibration=own), sensing
 
 
 def held_parameters(joint: Joint) -> frozenset[str]:

@@ -44,23 +44,25 @@ def linear_parameters(
 ) -> tuple[str, ...]:
     """Largest set of parameters, `held` left out, that enter all balances jointly linearly.
 
-    The greedy set of :func:`casadi_models.equations.linear_set`, on the residuals of the balances.
+    The greedy set of :func:`casadi_models.equations.linear_set`, on the residuals of the balances;
+    behind it the calibration unknowns, which enter by their derivative.
     """
     p = model.equations.parameters
     stacked = ca.vertcat(*residual_expressions(model, sensing).values())
-    names = model.parameter_names
+    names, own = model.parameter_names, model.calibration
     edges: dict[int, set[int]] = {i: set() for i in range(len(names))}
     for row in ca.vertsplit(stacked):
         # a comparison has a derivative that is zero everywhere: no edge
         for i, j in zip(*ca.sparsify(ca.hessian(row, p)[0]).sparsity().get_triplet(), strict=True):
             edges[i].add(j)
     present = set(ca.jacobian(stacked, p).sparsity().get_triplet()[1])
-    chosen = {i for i in present if i not in edges[i] and names[i] not in held}
+    beside = {i for i in present if names[i] in own and names[i] not in held}
+    chosen = {i for i in present - beside if i not in edges[i] and names[i] not in held}
     while True:
         degree = {i: len(edges[i] & chosen) for i in chosen}
         worst = max(degree, key=lambda i: (degree[i], i), default=None)
         if worst is None or degree[worst] == 0:
-            return tuple(names[i] for i in sorted(chosen))
+            return tuple(names[i] for i in (*sorted(chosen), *sorted(beside)))
         chosen.discard(worst)
 
 
@@ -85,6 +87,8 @@ class RowMaker:
     names : tuple of str
         Parameters that are estimated.
     balances, shapes : tuple of str
+    off : (parameters,) array
+        What the readings are freed of already (:mod:`identification.online.calibration`).
     usual : (parameters,) array
         Prior range of parameters that have one whatever the joint: skews of clocks; 0 for others.
     like : (parameters,) int array
@@ -119,6 +123,7 @@ class RowMaker:
         self.eta = ca.SX.sym("eta", len(self.shapes))
         self.shape_values = np.array([self._value(n) for n in self.shapes])
         self.names = linear_parameters(model, sensing, held)
+        self.off = np.zeros(len(self.names))
         self.usual = np.array([USUAL_SKEW * dt if n in CLOCKS else 0.0 for n in self.names])
         self.like = _alike(model, self.names)
         expressions = residual_expressions(model, sensing)
@@ -126,7 +131,7 @@ class RowMaker:
         e = model.equations
         signals, p = e.signals.vector(), e.parameters
         columns = [model.parameter_names.index(n) for n in self.names]
-        fixed = self._values()
+        fixed, near, beside = self._values(), self._values(at_zero=False), model.calibration
 
         # every estimated term is there, whatever its size
         there = [
@@ -140,8 +145,12 @@ class RowMaker:
                 r = settled(whole, p, there)
                 (free,) = ca.substitute([r], [p], [fixed])
                 slopes = ca.jacobian(r, p)[:, columns]
-                (slopes,) = ca.substitute([slopes], [p], [fixed])
-                stacked += [free, *ca.vertsplit(slopes.T)]
+                (straight,) = ca.substitute([slopes], [p], [fixed])
+                (tangent,) = ca.substitute([slopes], [p], [near])
+                found = [
+                    (tangent if n in beside else straight)[i] for i, n in enumerate(self.names)
+                ]
+                stacked += [free, *found]
             return ca.vertcat(*stacked)
 
         self.width = 1 + len(self.names)
@@ -155,32 +164,26 @@ class RowMaker:
     def _value(self, name: str) -> float:
         return float(self.model.value_vector()[self.model.parameter_names.index(name)])
 
-    def _values(self) -> Any:
-        """Parameter vector with the estimated ones at zero, and symbols for the shapes."""
-        if self.shapes:
-            at = {n: self.eta[i] for i, n in enumerate(self.shapes)} | dict.fromkeys(
-                self.names, 0.0
-            )
-            return ca.vertcat(
-                *(
-                    at.get(n, v)
-                    for n, v in zip(
-                        self.model.parameter_names, self.model.value_vector(), strict=True
-                    )
-                )
-            )
-        return ca.DM(
-            [
-                0.0 if n in self.names else v
-                for n, v in zip(self.model.parameter_names, self.model.value_vector(), strict=True)
-            ]
-        )
+    def _values(self, *, at_zero: bool = True) -> Any:
+        """Parameter vector with the estimated ones at zero or as in the model, and symbols for
+        the shapes. In a model without values the stiffness is a usual one.
+        """
+        at: dict[str, Any] = {n: self.eta[i] for i, n in enumerate(self.shapes)}
+        stiffness = self.model.stiffness_name
+        if at_zero:
+            at |= dict.fromkeys(self.names, 0.0)
+        elif stiffness is not None and self._value(stiffness) == 0.0:
+            at[stiffness] = self.model.usual_values()[stiffness]
+        pairs = zip(self.model.parameter_names, self.model.value_vector(), strict=True)
+        values = [at.get(n, v) for n, v in pairs]
+        return ca.vertcat(*values) if self.shapes else ca.DM(values)
 
     def _split(self, out: Any, swept: Any, signals: Any, memory: Any, fixed: Any) -> None:
         """Part that is linear in the signals, and the laws to be evaluated at points: those that
         are averaged, then those whose rate is.
         """
-        slopes = ca.jacobian(out, signals)
+        # a comparison has a derivative that is zero everywhere, and is no line
+        slopes = ca.sparsify(ca.jacobian(out, signals))
         linear = np.zeros(slopes.shape, dtype=bool)
         for row, column in zip(*slopes.sparsity().get_triplet(), strict=True):
             entry = slopes[row, column]
@@ -407,7 +410,8 @@ class RowMaker:
         if self.made <= self.rows_before_ready:
             return None
         table = full.reshape(len(self.balances), self.width)
-        return table[:, 0].copy(), -table[:, 1:]
+        h = -table[:, 1:]
+        return table[:, 0] + h @ self.off, h
 
     @property
     def new_points(self) -> FloatArray:
@@ -438,6 +442,7 @@ class RowMaker:
             Signals at the last points, newest last; those that the kernel holds are enough.
         """
         self.made, self.signals = other.made, other.signals.copy()
+        self.off[:] = other.off
         self.speed[:] = other.speed
         raw = self._in[0]
         new = len(raw)

@@ -31,20 +31,27 @@ class Samples:
     """
 
     def __init__(self, timing: Timing, needs: Sequence[bool], alignment: Alignment) -> None:
-        self.timing, self._needs, self._alignment = timing, needs, alignment
-        self.lag = alignment.lead * timing.dt
-        """Time by which the window's last sample is older than the newest reading [s]."""
+        self.timing, self._needs, self.zero = timing, needs, 0.0
         self.memory = timing.window + timing.stride + alignment.taps.shape[1] - 1
         """Samples until a reading has left the window and what lies before it."""
+        self.alignment = alignment
         self.reset()
+
+    def align(self, alignment: Alignment, zero: float = 0.0) -> None:
+        """Begin the window anew with another alignment of as many taps, and `zero` taken off the
+        link position [rad]; which readings count stays.
+        """
+        self.alignment, self.zero = alignment, zero
+        self.lag = alignment.lead * self.timing.dt
+        """Time by which the window's last sample is older than the newest reading [s]."""
+        self._buffer = np.zeros((4 * self.timing.window, len(SOURCES)))
+        self._recent = np.zeros((alignment.taps.shape[1], len(SOURCES)))
+        self._end, self._started = 0, False
 
     def reset(self) -> None:
         """Before the first sample."""
-        self._buffer = np.zeros((4 * self.timing.window, len(SOURCES)))
-        self._recent = np.zeros((self._alignment.taps.shape[1], len(SOURCES)))
-        self._end = 0
-        self._started = self._doubt = False
-        self._lost = [0] * len(SOURCES)
+        self._doubt, self._lost = False, [0] * len(SOURCES)
+        self.align(self.alignment, self.zero)
 
     @property
     def window(self) -> FloatArray:
@@ -59,7 +66,9 @@ class Samples:
     def add(self, new: tuple[float, float, float, float]) -> None:
         """Append a sample; the first one fills the window."""
         length = self.timing.window
-        if self._alignment.late:
+        if self.zero:
+            new = (new[0], new[1] - self.zero, new[2], new[3])
+        if self.alignment.shifts:
             new = self._aligned(new)
         if self._end == len(self._buffer):
             self._buffer[:length] = self._buffer[-length:].copy()
@@ -78,7 +87,7 @@ class Samples:
             recent[:] = new
         recent[:-1] = recent[1:].copy()
         recent[-1] = new
-        a, b, c, d = np.einsum("kj,jk->k", self._alignment.taps, recent).tolist()
+        a, b, c, d = np.einsum("kj,jk->k", self.alignment.taps, recent).tolist()
         return a, b, c, d
 
     def mark(

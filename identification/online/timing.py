@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casadi_models import JointModel
-from identification.balance.clocks import ENCODERS, SIGNAL, cubic
+from identification.balance.clocks import ENCODERS, MOST_SKEW, SIGNAL, cubic
 from identification.balance.weak import HALF, differentiated_kernel, kernel, whole
 
 FloatArray = npt.NDArray[np.float64]
@@ -109,20 +109,40 @@ class Alignment:
         Oldest reading first; one column where no channel is late.
     left : mapping of str to float
         What is left to the model of each delay [s].
+    late : mapping of str to float
+        Samples by which each signal is shifted.
     """
 
     lead: int
     taps: FloatArray
     left: Mapping[str, float]
+    late: Mapping[str, float]
 
     @property
-    def late(self) -> bool:
+    def shifts(self) -> bool:
         """True where there is anything to do."""
-        return bool(self.taps.shape[1] > 1)
+        return bool(np.any(self.taps[:, -1] != 1.0))
 
     @staticmethod
-    def of(model: JointModel, sources: Sequence[str], dt: float) -> Alignment:
-        """The alignment of a model's delays at their values; `sources` are signals' names."""
+    def of(
+        model: JointModel,
+        sources: Sequence[str],
+        dt: float,
+        found: Mapping[str, float] | None = None,
+    ) -> Alignment:
+        """The alignment of a model's delays at their values.
+
+        Parameters
+        ----------
+        model : JointModel
+        sources : sequence of str
+            Signals' names.
+        dt : float
+            Sample time [s].
+        found : mapping of str to float, optional
+            Skews beyond these delays [samples]; the taps have room for :data:`MOST_SKEW` either
+            way.
+        """
         values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
         late, left = dict.fromkeys(sources, 0.0), {}
         for place, signal in SIGNAL.items():
@@ -132,10 +152,17 @@ class Alignment:
                 off = near if place in ENCODERS or abs(samples - near) < HALF else samples
                 late[signal] += off
                 left[name] = (samples - off) * dt
+        room = 0
+        if found is not None:
+            room = _newest(max(0.0, *late.values()) + MOST_SKEW) + _oldest(
+                MOST_SKEW - min(0.0, *late.values())
+            )
+        for signal, skew in (found or {}).items():
+            late[signal] += skew
         # a cubic between two readings needs one more on either side
         lead = max(0, *(_newest(d) for d in late.values()))
         ages = {s: lead - d for s, d in late.items()}
-        length = 1 + max(_oldest(a) for a in ages.values())
+        length = 1 + max(room, *(_oldest(a) for a in ages.values()))
         taps = np.zeros((len(sources), length))
         for k, source in enumerate(sources):
             whole = math.floor(ages[source])
@@ -146,7 +173,7 @@ class Alignment:
                 else ((whole, 1.0),)
             ):
                 taps[k, length - 1 - age] = weight
-        return Alignment(lead, taps, left)
+        return Alignment(lead, taps, left, late)
 
 
 def _newest(late: float) -> int:

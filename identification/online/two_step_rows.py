@@ -111,7 +111,7 @@ class ShapedBalances:
 
     def __init__(self, rows: RowMaker) -> None:
         self._model, self.shapes, self.names = rows.model, rows.shapes, rows.names
-        self.usual, self.like = rows.usual, rows.like
+        self.usual, self.like, self._off = rows.usual, rows.like, rows.off
         self._linear_of, self._linear = rows.linear_of, rows.linear.copy()
         self._linear_moves = bool(rows.linear_of.jac_sparsity(0, 0).nnz())
         self._width, self._count = rows.width, len(rows.balances)
@@ -207,7 +207,8 @@ class ShapedBalances:
         laws = _blocks(lambda part: self._whole.matrix(part, eta), at, tick)
         known = _blocks(lambda part: self._whole.remainder(part, eta), at, tick)
         linear = self._linear_table(window, eta)
-        return linear[:, :, 0] + self._averaged(known), -(linear[:, :, 1:] + self._averaged(laws))
+        h = -(linear[:, :, 1:] + self._averaged(laws))
+        return linear[:, :, 0] + self._averaged(known) + h @ self._off, h
 
     def _points(self, window: RowWindow) -> FloatArray:
         return np.ascontiguousarray(window.points[1:].reshape(-1, len(self.used)))

@@ -24,13 +24,15 @@ static void tell(Twin *m, int once, const char *format, ...) { /* a text once pe
 }
 
 enum { HEALTH_OK, WARMING_UP, NUMERIC_TROUBLE, STEP_MISMATCH, INTERNAL_ERROR };
-enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
+enum { TELL_STEP = N_VARIABLES, TELL_SETUP, TELL_WINDOW, TELL_SENSORS, TELL_UNEVEN, TELL_FAULT }; /* places in `told` after those of the variables */
 
 /* ---- life --------------------------------------------------------------------------------------------------------- */
 
 static void clear_estimator(Twin *m) {
     State *s = &m->s;
     int i;
+    memset(s->off, 0, sizeof s->off);
+    s->n_heard = s->deaf = 0;
     clear_rows(m);
     memset(&s->watch, 0, sizeof s->watch);
     memset(&s->grid, 0, sizeof s->grid);
@@ -101,6 +103,7 @@ static int configure(Twin *m) { /* take the parameters over; 0 where they ask fo
     if (!s->configured) {
         s->warm_up = warm_up;
         s->collect = (int)fmax(2 * N_THETA, rows);
+        s->room = STRIDE * (s->collect + s->collect / 4 + ROWS_BEFORE_READY);
         s->detect = HAS_DETECTOR && s->whole[V_DETECT];
         s->drift = s->real[V_DRIFT];
         s->alarm_drift = s->real[V_ALARM_DRIFT];
@@ -128,20 +131,18 @@ static void floors(Twin *m) {
     if (!m->s.rls.running) return;
     noise_floor(m, m->s.theta, m->s.floor);
     tell_noise(&m->s);
-    deviations(&m->s);
+    deviations(&m->s, m->s.sigma);
     ratios(&m->s);
 }
 
-static void collect_row(Twin *m) {
+static void collect_row(Twin *m, double time) {
     State *s = &m->s;
-    FirstWindow *f = &s->window;
     int b;
-    memcpy(f->y[f->count], m->y, sizeof m->y);
-    memcpy(f->h[f->count], m->h, sizeof m->h);
-    standstill(m, f->shares[f->count]);
-    for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
-    if (++f->count < s->collect) return;
-    if (begin_recursion(m)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
+    keep_row(m);
+    if (s->window.count < s->collect) return;
+    if (begin_recursion(m, time)) tell(m, TELL_WINDOW, "the first window does not determine every parameter");
+    for (b = 0; b < N_THETA; b++)
+        if (s->off[b] != 0) tell(m, TELL_SENSORS, "the sensors have a zero or skews: they are taken off the readings");
     floors(m);
     for (b = 0; b < N_BALANCES; b++) s->first_level[b] = sqrt(s->square[b]);
 }
@@ -194,8 +195,7 @@ static int take_row(Twin *m, double time, int enable) {
     State *s = &m->s;
     double size[N_BALANCES], theta[N_THETA];
     int on[N_BALANCES], any = 0, all = 1, over, b, k;
-    if (!make_row(m, time)) return 0;
-    s->n_rows++;
+    const int made = make_row(m, time);
     for (b = 0; b < N_BALANCES; b++) {
         on[b] = 1;
         for (k = 0; k < SOURCES; k++)
@@ -203,8 +203,11 @@ static int take_row(Twin *m, double time, int enable) {
         any |= on[b];
         all &= on[b];
     }
+    if (s->n_heard) s->told[s->n_heard / STRIDE - 1] = (unsigned char)(enable && all);
+    if (!made) return 0;
+    s->n_rows++;
     if (!s->rls.running) {
-        if (enable && all) collect_row(m);
+        if (enable && all) collect_row(m, time);
         return 1;
     }
     over = check_row(m, on);
@@ -278,6 +281,7 @@ static void push(State *s, const int good[SENSORS], int counts) {
     const double sample[SOURCES] = {q[Q_M], present[Q_L] ? q[Q_L] : q[Q_M], q[TAU], q[DRIVE]};
     int k;
     append_sample(&s->rows, sample);
+    hear(s, sample);
     for (k = 0; k < SOURCES; k++) {
         const int i = reading[k], bad = (!(good[i] && counts) && needs[i]) || (s->detect && s->detector.failed[i]);
         if (bad || s->watch.constant[i] || s->watch.scaled[i]) s->lost[k] = LOST_SAMPLES;

@@ -2,24 +2,26 @@
 
 static void clear_rows(Twin *m) {
     memset(&m->s.rows, 0, sizeof m->s.rows);
+    align(m);
 }
 
-/* Take late channels at their true time: identification.online.timing.Alignment. */
-static void align(Rows *r, const double reading[SOURCES], double sample[SOURCES]) {
+/* Signals at their true time, from the newest readings. */
+static void take_aligned(Rows *r, const double reading[SOURCES], double sample[SOURCES]) {
     int i, k;
     if (!r->any)
         for (i = 0; i < TAPS; i++) memcpy(r->recent[i], reading, sizeof r->recent[i]);
     memmove(r->recent[0], r->recent[1], (TAPS - 1) * sizeof r->recent[0]);
     memcpy(r->recent[TAPS - 1], reading, sizeof r->recent[0]);
     for (k = 0; k < SOURCES; k++)
-        for (i = 0, sample[k] = 0; i < TAPS; i++) sample[k] += tap[k][i] * r->recent[i][k];
+        for (i = 0, sample[k] = 0; i < TAPS; i++) sample[k] += r->tap[i][k] * r->recent[i][k];
 }
 
-static void append_sample(Rows *r, const double reading[SOURCES]) {
-    double sample[SOURCES];
+static void append_sample(Rows *r, const double read[SOURCES]) {
+    double reading[SOURCES], sample[SOURCES];
     int i;
-    if (TAPS > 1) align(r, reading, sample);
-    else memcpy(sample, reading, sizeof sample);
+    memcpy(reading, read, sizeof reading);
+    reading[LINK_SOURCE] -= r->zero;
+    take_aligned(r, reading, sample);
     if (!r->any) { /* before the first sample stands the first sample */
         for (i = 0; i < 2 * WINDOW; i++) memcpy(r->history[i], sample, sizeof r->history[i]);
         r->any = 1;
@@ -77,7 +79,7 @@ static int make_row(Twin *m, double time) {
     for (i = 0; i < PLACES; i++)
         r->signals[place_signal[i]] =
             correlate(average_kernel[place_order[i]], AVERAGE_HALF, window + (CENTRE - AVERAGE_HALF), place_source[i], place_order[i]);
-    r->signals[0] = time - DELAY;
+    r->signals[0] = time - r->lead * SAMPLE_TIME - DELAY;
     for (i = 0; i < N_LINEAR; i++) full[linear_row[i]] += linear_value[i] * r->signals[linear_column[i]];
     for (i = 0; i < N_NEEDED; i++) {
         const double *weight = i < N_AVERAGED ? point_weight : rate_weight;
@@ -87,8 +89,12 @@ static int make_row(Twin *m, double time) {
     }
     if (r->made <= ROWS_BEFORE_READY) return 0;
     for (b = 0; b < N_BALANCES; b++) {
-        m->y[b] = full[b * (1 + N_THETA)];
-        for (i = 0; i < N_THETA; i++) m->h[b * N_THETA + i] = -full[b * (1 + N_THETA) + 1 + i];
+        double freed = 0;
+        for (i = 0; i < N_THETA; i++) {
+            m->h[b * N_THETA + i] = -full[b * (1 + N_THETA) + 1 + i];
+            freed += m->h[b * N_THETA + i] * m->s.off[i];
+        }
+        m->y[b] = full[b * (1 + N_THETA)] + freed;
     }
     return 1;
 }

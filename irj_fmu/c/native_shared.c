@@ -1,8 +1,9 @@
 /* What both wrappers of a native estimator hold: its parts, its start, and which variable may be set when. */
 #include "native_state.h"
+#include "native_algebra.c"
+#include "native_calibration.c"
 #include "native_rows.c"
 #include "native_watch.c"
-#include "native_algebra.c"
 #include "native_guard.c"
 #include "native_window.c"
 #include "native_residuals.c"

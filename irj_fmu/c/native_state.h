@@ -16,12 +16,13 @@ typedef long long Count;
 
 typedef struct { /* the last samples and the points of the nonlinear laws; RowMaker */
     double history[2 * WINDOW][SOURCES]; /* each sample twice, so that the last WINDOW lie in one piece */
-    double recent[TAPS][SOURCES]; /* readings not yet in the history, oldest first; Alignment */
+    double recent[TAPS][SOURCES], tap[TAPS][SOURCES]; /* last readings, oldest first, and their weights; Alignment */
+    double zero; /* taken off the link position */
     double ring[POINTS][DIM(N_NEEDED)], speed[POINTS][2];
     double before[DIM(N_COORDINATES)], held[DIM(N_MEMORY)], started;
     double signals[N_SIGNALS];
     Count made;
-    int end, since, any;
+    int end, since, any, lead;
 } Rows;
 
 typedef struct { /* Watch */
@@ -81,7 +82,10 @@ typedef struct {
     double residual[N_BALANCES], floor[N_BALANCES], ratio[N_BALANCES], square[N_BALANCES], torque[N_BALANCES];
     double score[SENSORS];
     double warm_up, drift, alarm_drift, floor_share;
-    int collect, detect;
+    double off[N_THETA], heard[DIM(HEARD)][SOURCES]; /* what the readings are freed of, and those of the first window; Calibration */
+    unsigned char told[DIM(HEARD / STRIDE)];
+    int n_heard, deaf;
+    int collect, room, detect;
     double first_level[N_BALANCES];
     Count strained;
     int reoptimise;

@@ -246,7 +246,7 @@ static void clear_recursion(State *s) {
 }
 
 /* Standard deviations of the estimate. */
-static void deviations(State *s) {
+static void deviations(const State *s, double sigma[N_THETA]) {
     int i, j;
     for (i = 0; i < N_THETA; i++) {
         double sum = s->rls.fast[FAST_D + i];
@@ -254,21 +254,43 @@ static void deviations(State *s) {
             const double u = s->rls.fast[FAST_U + j * (j - 1) / 2 + i];
             sum += u * s->rls.fast[FAST_D + j] * u;
         }
-        s->sigma[i] = sqrt(sum * (s->scale[i] * s->scale[i]));
+        sigma[i] = sqrt(sum * (s->scale[i] * s->scale[i]));
     }
 }
 
-/* Start the recursion from the collected rows; gives the number of parameters that they do not determine. */
-static int begin_recursion(Twin *m) {
+/* Keep a row of the first window. */
+static void keep_row(Twin *m) {
     State *s = &m->s;
-    double first[N_THETA], range[N_THETA], known[N_THETA], least[N_BALANCES], floor[N_BALANCES];
+    FirstWindow *f = &s->window;
+    int b;
+    memcpy(f->y[f->count], m->y, sizeof m->y);
+    memcpy(f->h[f->count], m->h, sizeof m->h);
+    standstill(m, f->shares[f->count]);
+    for (b = 0; b < N_BALANCES; b++) s->torque[b] += s->rows.signals[reference_signal[b]] * s->rows.signals[reference_signal[b]];
+    f->count++;
+}
+
+/* Make the collected rows again, the readings freed of what the sensors are off by. */
+static void make_again(Twin *m, double time) {
+    State *s = &m->s;
+    int k;
+    clear_rows(m);
+    memset(&s->window, 0, sizeof s->window);
+    memset(s->torque, 0, sizeof s->torque);
+    for (k = 0; k < s->n_heard; k++) {
+        append_sample(&s->rows, s->heard[k]);
+        if (k % STRIDE == STRIDE - 1 && make_row(m, time - (s->n_heard - 1 - k) * SAMPLE_TIME) && s->told[k / STRIDE]) keep_row(m);
+    }
+}
+
+/* A recursion from the collected rows; gives the number of parameters that they do not determine. */
+static int start_recursion(Twin *m, double least[N_BALANCES]) {
+    State *s = &m->s;
+    double first[N_THETA], range[N_THETA], known[N_THETA], floor[N_BALANCES];
     double square[N_BALANCES * N_THETA];
     int i, b, k, undetermined;
     told_beside_noise(m, square);
-    for (b = 0; b < N_BALANCES; b++) {
-        s->torque[b] /= s->window.count;
-        least[b] = fmax(s->floor_share * sqrt(s->torque[b]), LEAST);
-    }
+    for (b = 0; b < N_BALANCES; b++) least[b] = fmax(s->floor_share * sqrt(s->torque[b] / s->window.count), LEAST);
     robust_fit(m, least, first);
     noise_floor(m, first, floor);
     for (b = 0; b < N_BALANCES; b++) least[b] = fmax(least[b], floor[b]);
@@ -277,14 +299,33 @@ static int begin_recursion(Twin *m) {
     share(known);
     for (i = 0; i < N_THETA; i++) s->scale[i] = usual_range[i] > 0 ? usual_range[i] : fmax(known[i], range[i]);
     clear_recursion(s);
-    undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, s->theta);
+    undetermined = start_values(m, s->rls.config + CONFIG_THETA0, s->scale, least, first);
     for (k = 0; k < N_BALANCES * N_THETA; k++) s->rls.fast[FAST_SIZE + k] = square[k] * (s->scale[k % N_THETA] * s->scale[k % N_THETA]);
     tell_noise(s);
-    estimate_of(s, &s->rls, first);
-    show(s, first);
-    deviations(s);
+    return undetermined;
+}
+
+/* Start the recursion from the collected rows; gives the number of parameters that they do not determine. */
+static int begin_recursion(Twin *m, double time) {
+    State *s = &m->s;
+    double theta[N_THETA], sigma[N_THETA], least[N_BALANCES];
+    int undetermined = start_recursion(m, least), free, round, b;
+    for (free = !(N_ZEROS && HAS_VALUES); free < 2 && s->n_heard; free++)
+        for (round = 0; round < CALIBRATION_ROUNDS; round++) {
+            estimate_of(s, &s->rls, theta);
+            deviations(s, sigma);
+            if (!free) held_unknowns(m, theta, sigma);
+            if (!take_calibration(m, theta, sigma, least)) break;
+            make_again(m, time);
+            undetermined = start_recursion(m, least);
+        }
+    estimate_of(s, &s->rls, theta);
+    for (b = 0; b < N_BALANCES; b++) s->torque[b] /= s->window.count;
+    show(s, theta);
+    deviations(s, s->sigma);
     for (b = 0; b < N_BALANCES; b++) s->square[b] = residual_square(m, b, s->theta) / s->window.count;
     memset(&s->window, 0, sizeof s->window);
+    s->n_heard = 0;
     s->rls.running = 1;
     guard_start(s);
     return undetermined;

@@ -43,6 +43,7 @@ _SOURCES: Final = (
     "native_rows.c",
     "native_watch.c",
     "native_algebra.c",
+    "native_calibration.c",
     "native_guard.c",
     "native_window.c",
     "native_residuals.c",

@@ -18,6 +18,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.clocks import SURE, cubic
 from identification.balance.noise import CUT_DEVIATION, FOURTH_GAIN, KEPT
 from identification.data.joint_file import Joint
 from identification.errors import InputError
@@ -27,6 +28,7 @@ from identification.faults.detector import MOVED, PARITY_SENSORS, DetectorTables
 from identification.faults.residuals import COUNT, ENERGY_LEFT, ENERGY_TOP
 from identification.online import first_window, verdict
 from identification.online import watch as watch_settings
+from identification.online.calibration import FURTHER, ROUNDS
 from identification.online.estimator import OnlineEstimator
 from identification.online.first_window import ABSENT, RIDGE
 from identification.online.grid import ON_GRID
@@ -75,6 +77,7 @@ def generate(joint: Joint, made: OnlineEstimator, variables: Sequence[Variable],
     header.define("NATIVE_GUID", f'"{guid}"')
     _variable_tables(header, joint, made, variables)
     _row_tables(header, made)
+    _calibration_tables(header, made)
     _watch_tables(header, made)
     _recursion_tables(header, made)
     _fault_tables(header, made)
@@ -93,7 +96,9 @@ def _functions(made: OnlineEstimator) -> list[Any]:
 
     engine = made.recursion(made.theta).engine_for("generate")
     found = [engine.formulas.step, engine.formulas.check, made.rows.point, made.rows.slopes]
-    own = [made.check.function, made.check.weight, made.rows.still]
+    part = ca.SX.sym("part")
+    between = ca.Function("cubic", [part], [ca.vertcat(*cubic(part))])
+    own = [made.check.function, made.check.weight, made.rows.still, between]
     if made.detector is not None:
         found.append(made.detector.tables().function)
     recursion = []
@@ -234,11 +239,10 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.define("WINDOW", t.window)
     header.define("STRIDE", t.stride)
     header.define("CENTRE", centre)
-    header.define("DELAY", float(t.delay + made.samples.lag))
+    header.define("DELAY", float(t.delay))
     header.define("LOST_SAMPLES", made.samples.memory)
-    taps = rows.alignment.taps
-    header.define("TAPS", taps.shape[1])
-    header.doubles("tap", taps)
+    header.define("TAPS", made.samples.alignment.taps.shape[1])
+    header.doubles("delay_samples", [rows.alignment.late[n] for n in SOURCES])
     header.define("SAMPLE_TIME", float(t.dt))
     header.define("ROW_PERIOD", float(t.stride * t.dt))
     new = t.stride // t.step
@@ -296,6 +300,24 @@ def _row_tables(header: _Header, made: OnlineEstimator) -> None:
     header.whole("theta_value", (names.index(n) for n in rows.names))
 
 
+def _calibration_tables(header: _Header, made: OnlineEstimator) -> None:
+    own = made.calibration
+    header.define("LINK_SOURCE", SOURCES.index("link_position"))
+    header.define("HAS_VALUES", int(made.has_values))
+    header.define("N_UNKNOWNS", len(own.unknowns))
+    header.whole("unknown_theta", own.unknowns)
+    header.define("N_SKEWS", len(own.skews))
+    header.whole("skew_theta", own.skews)
+    header.whole("skew_source", (SOURCES.index(n) for n in own.skews.values()))
+    header.define("N_ZEROS", len(own.zeros))
+    header.whole("zero_theta", own.zeros)
+    header.define("MOST_LATE", float(own.most))
+    header.define("NEAR_LATE", float(own.near))
+    header.define("CALIBRATION_ROUNDS", ROUNDS)
+    header.define("CALIBRATION_FURTHER", FURTHER)
+    header.define("CALIBRATION_SURE", float(SURE))
+
+
 def _support(kernels: FloatArray, centre: int) -> tuple[int, FloatArray]:
     """Half width of the part that is not zero, about a sample, and that part of each kernel."""
     used = np.flatnonzero(np.any(kernels != 0.0, axis=0))
@@ -341,7 +363,9 @@ def _recursion_tables(header: _Header, made: OnlineEstimator) -> None:
     engine = made.recursion(made.theta).engine_for("generate")
     layout, n = engine.layout, len(made.names)
     fast, slow = start_state(layout, np.zeros(n), engine.config)
-    header.define("COLLECT", max(made.collect, round(MAX_WARM_UP / period)))
+    collect = max(made.collect, round(MAX_WARM_UP / period))
+    header.define("COLLECT", collect)
+    header.define("HEARD", made.room_of(collect) if made.calibration else 0)
     header.define("LEAST", LEAST)
     header.define("ABSENT", ABSENT)
     header.define("RIDGE", RIDGE)

@@ -156,6 +156,7 @@ def both(
     table: FloatArray,
     parameters: Mapping[str, Any] | None = None,
     events: Events | None = None,
+    step: float = STEP,
 ) -> tuple[FloatArray, FloatArray, dict[str, list[str]]]:
     """All outputs of native and Python estimator after each sample, reals first, and their
     names by type.
@@ -169,9 +170,9 @@ def both(
             for kind, name, value in events.get(k, ()):
                 native.instance.call(f"set{kind}", [native.vr[name]], [value])
                 getattr(python, f"set_{kind.lower()}")([native.vr[name]], [value])
-            native.step(row, k * STEP)
+            native.step(row, k * step, step)
             python.set_real(native.inputs, row.tolist())
-            python.do_step(k * STEP, STEP)
+            python.do_step(k * step, step)
             found.append(native.outputs())
             expected.append(
                 [
@@ -311,12 +312,44 @@ def test_equals_python_on_whole_encoder_steps(spec: NativeSpec, fmu: Path, tmp_p
     readings = readings_of("hd3", 5.0)
     step = 2 * np.pi / 2**14
     readings[:, [1, 3]] = np.round(readings[:, [1, 3]] / step) * step
-    found, expected, names = both(spec, fmu, tmp_path, readings, {"warm_up": 1.5})
+    found, expected, names = both(spec, fmu, tmp_path, readings, {"warm_up": 1.2})
     reals = len(names["Real"])
     assert largest(found, expected, reals) <= 1e-9
     np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
     running = expected[:, reals + names["Integer"].index("health")] != 1
     assert running.any()
+
+
+GAP = {"backlash_stiffness_loss": 2e4, "backlash": 5e-4}
+
+
+@pytest.mark.parametrize("kind", ["straight", "gap"])
+def test_equals_python_where_sensors_have_a_zero_and_skews(kind: str, tmp_path: Path) -> None:
+    """Rows made again with shifted channels and without the zero: the same on both sides, and
+    through a reset.
+    """
+    joint = reference_joint("hd3")
+    if kind == "gap":
+        effects = (*joint.effects, "backlash")
+        joint = replace(joint, effects=effects, fitted={**joint.fitted, **GAP})
+    built = 4 * STEP
+    options = replace(PLAIN, detect=False)
+    spec = NativeSpec(joint, "native", options, sample_time=built)
+    readings = readings_of("hd3", 8.0)[::4]
+    late = readings[10:].copy()
+    late[:, 3:5] = 0.4 * readings[8:-2, 3:5] + 0.6 * readings[7:-3, 3:5]
+    late[:, 3] += 2e-3
+    late[:, 5] = 0.7 * readings[9:-1, 5] + 0.3 * readings[10:, 5]
+    reset = {len(late) // 2: (("Boolean", "reset", True),)}
+    path = build_native(spec, tmp_path / "native.fmu")
+    given = {"warm_up": 1.5}
+    found, expected, names = both(spec, path, tmp_path / "python", late, given, reset, built)
+    reals = len(names["Real"])
+    assert largest(found, expected, reals) <= 1e-9
+    np.testing.assert_array_equal(found[:, reals:], expected[:, reals:])
+    at = estimated_parameters(joint, options).index("link_encoder_skew")
+    skew = found[-1, names["Real"].index(f"theta[{at + 1}]")]
+    assert skew == pytest.approx(2.6 * built, rel=0.1)
 
 
 @pytest.mark.parametrize("column", [1, 3])

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pytest
 
 from benchmarks.native import readings_of
-from identification.balance.dataset import HOLD_NAME
+from casadi_models.hold import UNKNOWNS
 from identification.online.estimator import OnlineEstimator, OnlineOptions
 from irj_fmu.convergence import forgotten
 from irj_fmu.cosim import link_referred
@@ -134,7 +134,7 @@ def test_what_is_known_is_no_less_sure_than_what_is_followed(free: tuple[str, ..
     held = joint.held()
     some = replace(held, known={n: k for n, k in held.known.items() if n not in free})
     every, few = (feed(OnlineEstimator(j, STEP, QUICK), "irj2b", 0, 5000) for j in (joint, some))
-    assert set(few.names) - {HOLD_NAME} == set(free)
+    assert set(few.names) - set(UNKNOWNS) == set(free)
     assert few.balances == every.balances == ("motor", "link", "transmission")
     size, theta = np.array([2.0, 0.5, 1.0]), np.zeros(len(few.names))
     dry = [joint.fitted[f"{side}_coulomb"] for side in ("motor", "link")]
