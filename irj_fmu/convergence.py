@@ -27,7 +27,7 @@ import numpy.typing as npt
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.faults.detector import KINDS, SENSORS, Fault, inject
-from identification.online.estimator import searched_parameters
+from identification.online.estimator import estimated_parameters, searched_parameters
 from identification.online.identifiable import identifiable
 from irj_fmu.command_line import OneLineParser, check_output, fail, run_alone, write_json
 from irj_fmu.cosim import (
@@ -142,6 +142,7 @@ class Bench:
             self.table * link_referred(joint),
             np.array(NOISE) * np.abs(link_referred(joint)),
             STEP,
+            estimated_parameters(model),
         )
         self.scale = float(np.quantile(np.abs(self.table[:, 5]), 0.99)) / 170.0
 

@@ -294,7 +294,7 @@ def cosimulate(
         messages = tuple(b.messages)
     ratios = {key: float(found[f"estimator.ratio.{key}"][-1]) for key in sensing.balances}
     readings = np.column_stack([found[c] for c in channels]) * link_referred(plant)
-    shown = identifiable(believed(plant, model), readings, np.zeros(6), setting.step)
+    shown = identifiable(believed(plant, model), readings, np.zeros(6), setting.step, names)
     return Cosimulation(found, names, tuple(_rows(plant, shown, found)), ratios, messages)
 
 

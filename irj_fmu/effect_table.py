@@ -198,7 +198,7 @@ def run(label: str, seeds: Sequence[int | None], sides: Sequence[Side]) -> Itera
             if seed is None
             else clean + np.random.default_rng(seed).normal(size=clean.shape) * noise
         )
-        shown = identifiable(joint, clean, noise, STEP)
+        shown = identifiable(joint, clean, noise, STEP, names)
         for side in sides:
             theta, sigma = (by_python if side == "python" else by_native)(known, readings)
             seen = plant + shown.seen(theta - plant)

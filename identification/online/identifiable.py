@@ -4,6 +4,7 @@ directions alone.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -59,6 +60,7 @@ def identifiable(
     readings: FloatArray,
     noise: FloatArray,
     dt: float,
+    names: Sequence[str],
     options: OnlineOptions | None = None,
 ) -> Identifiable:
     """Directions that readings of a joint show, from its rows at its true values.
@@ -73,6 +75,8 @@ def identifiable(
         Standard deviation of each.
     dt : float
         Sample time [s].
+    names : sequence of str
+        What the estimator follows: one without values of the joint looks for no skew of a clock.
     options : OnlineOptions, optional
     """
     options = options or OnlineOptions()
@@ -80,7 +84,7 @@ def identifiable(
     rows = RowMaker(model, sensing, dt, held_parameters(truth))
     samples = Samples(rows.timing, [True] * 6, rows.alignment)
     values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
-    theta = np.array([values[n] for n in rows.names])
+    whole = np.array([values[n] for n in rows.names])
     kept_y, kept_h = [], []
     for k, row in enumerate(readings.tolist()):
         samples.add((row[Q_M], row[Q_L], row[TAU], row[DRIVE]))
@@ -89,16 +93,18 @@ def identifiable(
             if found is not None:
                 kept_y.append(found[0])
                 kept_h.append(found[1])
-    y, h = np.array(kept_y), np.array(kept_h)
-    scale = prior_range(theta, theta, h, y, rows.usual, rows.like)
+    own = [rows.names.index(n) for n in names]
+    y, h, theta = np.array(kept_y), np.array(kept_h)[:, :, own], whole[own]
+    like = np.array([own.index(next(j for j in own if rows.like[j] == rows.like[i])) for i in own])
+    scale = prior_range(theta, theta, h, y, rows.usual[own], like)
     least = np.maximum(
         options.floor_share * np.sqrt(np.mean(y**2, axis=0)),
-        rows.floor(theta.tolist(), noise[list(SAMPLED)]),
+        rows.floor(whole.tolist(), noise[list(SAMPLED)]),
     )
     weighted = (h * scale / (np.sqrt(rows.timing.overlap) * least)[:, None]).reshape(-1, theta.size)
     value, vector = np.linalg.eigh(weighted.T @ weighted)
     return Identifiable(
-        rows.names, scale, vector[:, 1.0 / (1.0 + np.maximum(value, 0.0)) > UNDETERMINED]
+        tuple(names), scale, vector[:, 1.0 / (1.0 + np.maximum(value, 0.0)) > UNDETERMINED]
     )
 
 

@@ -100,7 +100,7 @@ class ShapedBalances:
         Signals that the laws need at the points.
     balances, coefficients : tuple of int
         The balances that the shapes enter, with those that share a parameter with them, and their
-        parameters.
+        parameters; what the sensors are off by, which all share, is held in a search.
     usual, like : (parameters,) array
         See :class:`identification.online.rows.RowMaker`.
     lead : int
@@ -112,6 +112,7 @@ class ShapedBalances:
     def __init__(self, rows: RowMaker) -> None:
         self._model, self.shapes, self.names = rows.model, rows.shapes, rows.names
         self.usual, self.like, self._off = rows.usual, rows.like, rows.off
+        self._beside = [i for i, n in enumerate(rows.names) if n in rows.model.calibration]
         self._linear_of, self._linear = rows.linear_of, rows.linear.copy()
         self._linear_moves = bool(rows.linear_of.jac_sparsity(0, 0).nnz())
         self._width, self._count = rows.width, len(rows.balances)
@@ -142,6 +143,7 @@ class ShapedBalances:
     def _group(self, rows: RowMaker, laws: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
         linear = np.any(self._linear != 0, axis=1).reshape(self._count, self._width)
         there = linear | self._filled(rows)
+        there[:, [1 + i for i in self._beside]] = False
         moved = {
             int(r) % laws.shape[0] % self._count
             for r in ca.jacobian_sparsity(ca.vec(laws), rows.eta).get_triplet()[0]
@@ -217,11 +219,23 @@ class ShapedBalances:
         linear = np.array(self._linear_of(eta)) if self._linear_moves else self._linear
         return (window.signals[self.lead :] @ linear.T).reshape(-1, self._count, self._width)
 
+    def _sensors(
+        self, window: RowWindow, eta: FloatArray, theta: FloatArray, tick: Callable[[], None]
+    ) -> FloatArray:
+        """Part of y that is left to what the sensors are off by, (rows, balances)."""
+        if not self._beside:
+            return np.zeros((len(window.signals) - self.lead, self._count))
+        _, h = self.table(window, eta, tick)
+        left = (theta - self._off)[self._beside]
+        found: FloatArray = h[:, :, self._beside] @ left
+        return found
+
     def model(
         self,
         window: RowWindow,
         weight: FloatArray,
         eta: FloatArray,
+        theta: FloatArray,
         shapes: Sequence[Shape],
         tick: Callable[[], None],
     ) -> tuple[SeparableModel, FloatArray, FloatArray]:
@@ -235,6 +249,8 @@ class ShapedBalances:
             Weight of each row; 0 leaves it out.
         eta : (shapes,) array
             Shapes now.
+        theta : (parameters,) array
+            Estimate now: what the sensors are off by stays.
         shapes : sequence of Shape
             With their boxes.
         tick : callable
@@ -255,12 +271,15 @@ class ShapedBalances:
 
         fixed = linear(eta)
         moves, part = self._linear_moves, self._part
+        held = self._sensors(window, eta, theta, tick)[rows][:, balances] * scale
 
         def phi(index: FloatArray, nonlinear: FloatArray) -> FloatArray:
             laws = _blocks(lambda p: part.matrix(p, nonlinear), points, tick)
             tick()
-            held = linear(nonlinear) if moves else fixed
-            found: FloatArray = -(held[:, :, 1:] + self._averaged(laws)[rows]) * scale[:, :, None]
+            straight = linear(nonlinear) if moves else fixed
+            found: FloatArray = (
+                -(straight[:, :, 1:] + self._averaged(laws)[rows]) * scale[:, :, None]
+            )
             return found[index[:, 0].astype(np.intp)]
 
         def free(nonlinear: FloatArray) -> FloatArray:
@@ -269,11 +288,11 @@ class ShapedBalances:
                 if part.rest is not None
                 else 0.0
             )
-            held = linear(nonlinear) if moves else fixed
+            straight = linear(nonlinear) if moves else fixed
             found: FloatArray = (
-                held[:, :, 0] + (known[rows] if isinstance(known, np.ndarray) else 0.0)
+                straight[:, :, 0] + (known[rows] if isinstance(known, np.ndarray) else 0.0)
             ) * scale
-            return found
+            return found - held
 
         y = free(eta)
 

@@ -133,7 +133,9 @@ def search(
         return nothing(task, "too few rows whose readings were all there", good=True)
     try:
         shapes = boxes(model, balances.shapes, task)
-        separable, y, index = balances.model(task.window, task.weight, task.eta, shapes, tick)
+        separable, y, index = balances.model(
+            task.window, task.weight, task.eta, task.theta, shapes, tick
+        )
         weights, ratio = _before(task, separable, y, index, group, settings)
         if not (task.first or task.forced) and ratio <= settings.confirm_limit:
             return nothing(

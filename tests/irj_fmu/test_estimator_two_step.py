@@ -101,7 +101,10 @@ def test_rows_of_a_window_equal_the_rows_made(readings: list[list[float]]) -> No
     expected = [row for row in made if row is not None][-len(y) :]
     np.testing.assert_allclose(y, [row[0] for row in expected], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(h, [row[1] for row in expected], rtol=1e-11, atol=1e-11)
-    separable, free, index = balances.model(kept, np.ones((len(y), 3)), eta, (), lambda: None)
+    theta = held.theta
+    separable, free, index = balances.model(
+        kept, np.ones((len(y), 3)), eta, theta, (), lambda: None
+    )
     assert balances.balances == (0,)
     np.testing.assert_allclose(
         separable.matrix(index, eta)[:, 0], h[:, 0, list(balances.coefficients)], rtol=1e-12
@@ -129,7 +132,7 @@ def test_slopes_of_the_shapes(readings: list[list[float]]) -> None:
     eta = np.array([0.04, 1.2])
     shapes = [Shape(n, 0.01, 2.0, 1.0) for n in balances.shapes]
     separable, _, index = balances.model(
-        kept, np.ones((len(kept.signals) - balances.lead, 3)), eta, shapes, lambda: None
+        kept, np.ones((len(kept.signals) - balances.lead, 3)), eta, held.theta, shapes, lambda: None
     )
     theta = np.arange(1.0, 1.0 + len(balances.coefficients))
     found = separable.gradient(index, eta, theta)
