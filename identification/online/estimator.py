@@ -38,9 +38,9 @@ from identification.online.pulse import GAP, Pulse
 from identification.online.row_check import LEAST, RowCheck
 from identification.online.rows import SOURCES, RowMaker
 from identification.online.samples import Samples
+from identification.online.shapes.two_step import Reoptimiser, make_two_step
 from identification.online.state import Sample, State, joined, pack, parted, unpack
 from identification.online.timing import Alignment
-from identification.online.two_step import Reoptimiser, make_two_step
 from identification.online.verdict import (
     FAULT_TEXT,
     HELD,

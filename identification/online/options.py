@@ -12,7 +12,7 @@ from identification.balance.sensing import Sensing, adapt
 from identification.data.joint_file import Joint
 from identification.errors import InputError
 from identification.online.rows import linear_parameters
-from identification.online.two_step_rows import shape_parameters
+from identification.online.shapes.rows import shape_parameters
 
 
 @final

@@ -19,7 +19,7 @@ from identification.online.estimator import (
 )
 from identification.online.guard import Guard
 from identification.online.rows import RowMaker
-from identification.online.two_step_rows import RowWindow
+from identification.online.shapes.rows import RowWindow
 from identification.recursive.estimator import RecursiveLeastSquares, Settings
 from identification.two_step.algorithm import Shape
 from irj_fmu.convergence import Bench, failure, forgotten

@@ -14,7 +14,7 @@ import pytest
 
 from identification.data.joint_file import Joint
 from identification.errors import InputError
-from identification.online.estimator import OnlineOptions
+from identification.online.estimator import OnlineOptions, estimated_parameters
 from irj_fmu.corrected.build import export_corrected
 from irj_fmu.estimator.native import NativeSpec
 from irj_fmu.estimator.native_fmi3 import build_native_fmi3
@@ -190,11 +190,12 @@ def test_arrays_and_other_types_of_fmi_3_go_through(folder: Path) -> None:
             fmu.setBoolean([at["enable"], at["valid.q_l"]], [True, k % 2 == 0])
             fmu.doStep(k * 1e-3, 1e-3)
         # the drive is the wrapper's own, the arrays are the FMU's: one call for both
-        theta = fmu.getFloat64([at["i_m"], at["theta"], at["ratio.motor"], at["sigma"]], 24)
+        count = 2 + 2 * len(estimated_parameters(joint))
+        theta = fmu.getFloat64([at["i_m"], at["theta"], at["ratio.motor"], at["sigma"]], count)
         more = fmu.getInt32([at["n_samples"], at["n_rows"]]), fmu.getInt64([at["health"]])
         texts = fmu.getString([at["joint_file"]]), fmu.getBoolean([at["alarm"]])
         found.append((list(theta), *map(list, more), *map(list, texts)))
-        assert len(found[-1][0]) == 24
+        assert len(found[-1][0]) == count
         with pytest.raises(Exception, match="getFloat64|GetFloat64"):
             fmu.getFloat64([at["i_m"], at["theta"]], 3)
         fmu.terminate()

@@ -3,13 +3,16 @@ known.
 
 ``python -m tests.recorded_world.values --joints 30 --start 9100`` prints, for each parameter, how
 far it is off and in how many joints its band of 95 % holds the truth; ``--only TROUBLE`` and
-``--without TROUBLE ...`` as the campaign has them.
+``--without TROUBLE ...`` as the campaign has them. With ``--online`` they are the values at the end
+of the second record that `irj track` follows with what was fitted to the first.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -18,6 +21,7 @@ from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 
+from tests.recorded_world.sensors import SETS
 from tests.recorded_world.world import TROUBLES, make_case, write_case
 
 if TYPE_CHECKING:
@@ -60,28 +64,54 @@ class Value:
         return abs(self.found - self.true) / max(BAND * self.error, 1e-300)
 
 
-def values_of(seed: int, *, without: Collection[str] = ()) -> list[Value]:
-    """Fit the model of the joint file to a joint with nothing hidden."""
-    from identification import fit, load_joint, read
-
+def values_of(
+    seed: int, given: str = "all", *, without: Collection[str] = (), online: bool = False
+) -> list[Value]:
+    """Fit the model of the joint file to a joint with nothing hidden, as the sensors `given` see
+    it; with `online`, follow its second record.
+    """
     case = make_case(seed, kind="none", without=without)
     with tempfile.TemporaryDirectory() as top:
-        folder = write_case(case, Path(top), "all")
-        joint = load_joint(folder / "joint.toml")
-        solution = fit(joint, read(folder / "train.csv", joint=joint)).solution
+        folder = write_case(case, Path(top), given)
+        values, errors = followed(folder) if online else fitted(folder)
     out = []
     for name, key in TRUTH.items():
-        error = solution.stderr.get(name)
+        error = errors.get(name)
         if name == "gravity_torque":
             continue
         if error is not None and case.joint.values.get(key):
-            out.append(
-                Value(seed, name, case.joint.values[key], solution.values[name], float(error))
-            )
-    gravity = _gravity(solution.values, solution.stderr)
+            out.append(Value(seed, name, case.joint.values[key], values[name], float(error)))
+    gravity = _gravity(values, errors)
     if gravity is not None and case.joint.values["TG"]:
         out.append(Value(seed, "gravity_torque", case.joint.values["TG"], *gravity))
     return out
+
+
+def fitted(folder: Path) -> tuple[Mapping[str, float], Mapping[str, float | None]]:
+    """Values and standard errors of a fit to train.csv."""
+    from identification import fit, load_joint, read
+
+    joint = load_joint(folder / "joint.toml")
+    solution = fit(joint, read(folder / "train.csv", joint=joint)).solution
+    return solution.values, solution.stderr
+
+
+def followed(folder: Path) -> tuple[dict[str, float], dict[str, float | None]]:
+    """Values and standard deviations at the end of test.csv, as the commands give them."""
+
+    def irj(*words: str) -> None:
+        # 1: something was found, which here is a false alarm and no matter
+        done = subprocess.run(
+            [sys.executable, "-m", "workbench", *words], cwd=folder, capture_output=True, text=True
+        )
+        if done.returncode not in (0, 1):
+            raise RuntimeError(done.stderr)
+
+    irj("fit", "train.csv", "--joint", "joint.toml", "-o", "fitted.toml")
+    irj("track", "test.csv", "--joint", "fitted.toml", "--healthy", "train.csv", "--json", "out")
+    (record,) = json.loads((folder / "out").read_text(encoding="utf-8"))["records"]
+    own = record["parameters"]
+    return {n: p["value"] for n, p in own.items()}, {n: p["sigma"] for n, p in own.items()}
 
 
 def _gravity(
@@ -127,12 +157,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--without", nargs="*", choices=TROUBLES, default=[])
     parser.add_argument("--only", choices=TROUBLES)
+    parser.add_argument("--sensors", choices=SETS, default="all")
+    parser.add_argument("--online", action="store_true", help="follow the second record")
     parser.add_argument("--each", action="store_true", help="a line for each value, too")
     options = parser.parse_args(argv)
     without = [t for t in TROUBLES if t != options.only] if options.only else options.without
     found = []
     for seed in range(options.start, options.start + options.joints):
-        own = values_of(seed, without=without)
+        own = values_of(seed, options.sensors, without=without, online=options.online)
         found += own
         for v in own if options.each else ():
             sys.stdout.write(

@@ -248,8 +248,8 @@ def test_page_shows_faults_readings_and_parameters(page: str) -> None:
         "put into healthy readings on purpose",
     ):
         assert words in page
-    assert page.count('class="s-after band"') == 12, (
-        "a band for every parameter, the hold of the current too"
+    assert page.count('class="s-after band"') == 15, (
+        "a band for every parameter, the hold of the current and what the sensors are off by, too"
     )
 
 

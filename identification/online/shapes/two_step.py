@@ -16,8 +16,8 @@ from identification.errors import InputError
 from identification.linear.triangle import single_thread
 from identification.online.options import OnlineOptions, held_parameters
 from identification.online.rows import RowMaker
-from identification.online.two_step_rows import RowWindow, ShapedBalances, shape_parameters
-from identification.online.two_step_search import Found, Recursion, Task, nothing, search
+from identification.online.shapes.rows import RowWindow, ShapedBalances, shape_parameters
+from identification.online.shapes.search import Found, Recursion, Task, nothing, search
 from identification.two_step.algorithm import Mode, OnlineSettings, TwoStepSettings
 from identification.two_step.online import PortionedTask
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from casadi_models import JointModel
 from identification.errors import InputError
 from identification.online.first_window import least_squares, prior_range, told_beside_noise
-from identification.online.two_step_rows import SIGNALS, RowWindow, ShapedBalances
+from identification.online.shapes.rows import SIGNALS, RowWindow, ShapedBalances
 from identification.recursive.estimator import RecursiveLeastSquares
 from identification.two_step.algorithm import (
     JOINT_CHANNELS,

@@ -1,0 +1,1 @@
+"""Shapes of friction and stiffness laws, searched while an online estimator runs."""
