@@ -12,6 +12,7 @@ of the reading makes good and no shift.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Final, final
 
@@ -33,6 +34,11 @@ a cubic one three samples, which are more than its whole twist, take six."""
 
 FURTHER: Final = 0.1
 """Share of what is too little to make rows again at which it ends once they are."""
+
+PARTS: Final = 256.0
+"""Parts of a sample to which a skew is rounded before it is taken off; a zero is to the power of
+two under a tenth of what is too little. The columns follow what is left, and another order of the
+same sums, as in C, gives the same readings."""
 
 
 @final
@@ -57,10 +63,12 @@ class Calibration:
         Signal by the number of the parameter: of what may be taken off.
     most, near : float
         Largest skew, and the change of one that is too small to make the rows again [s].
+    part : float
+        To which a skew is rounded [s].
     """
 
     def __init__(self, model: JointModel, names: Sequence[str], dt: float) -> None:
-        self._dt, self.most, self.near = dt, MOST_SKEW * dt, NEAR * dt
+        self._dt, self.most, self.near, self.part = dt, MOST_SKEW * dt, NEAR * dt, dt / PARTS
         own = {i: CLOCKS[n] for i, n in enumerate(names) if n in CLOCKS}
         bent = _bent_zeros(model)
         self.skews = {i: SIGNAL[u.place] for i, u in own.items() if u.place not in LOW_PASSED}
@@ -156,12 +164,13 @@ class Calibration:
         for i in self.skews:
             value = min(max(float(theta[i]), -self.most), self.most)
             if abs(value - found[i]) > limit[i]:
-                found[i] = value
+                found[i] = round(value / self.part) * self.part
         moved = any(abs(theta[i] - found[i]) > limit[i] for i in self.zeros)
         if np.array_equal(found, self.off) and not moved:
             return False
         for i in self.zeros:
-            found[i] = theta[i]
+            step = 2.0 ** math.floor(math.log2(FURTHER * small[i])) if small[i] < np.inf else 1.0
+            found[i] = round(float(theta[i]) / step) * step
         self.off = found
         return True
 

@@ -106,14 +106,18 @@ static int take_calibration(Twin *m, const double theta[N_THETA], const double s
         const int at = skew_theta[i];
         const double value = fmin(fmax(theta[at], -MOST_LATE), MOST_LATE);
         if (!(fabs(value - s->off[at]) > fmax(part * NEAR_LATE, CALIBRATION_SURE * sigma[at]))) continue;
-        s->off[at] = value;
+        s->off[at] = rint(value / LATE_PART) * LATE_PART;
         moved = 1;
     }
     for (i = 0; i < N_ZEROS; i++) {
         const int at = zero_theta[i];
         if (fabs(theta[at] - s->off[at]) > fmax(part * small_zero(m, at, least), CALIBRATION_SURE * sigma[at])) moved = 1;
     }
-    for (i = 0; moved && i < N_ZEROS; i++) s->off[zero_theta[i]] = theta[zero_theta[i]];
+    for (i = 0; moved && i < N_ZEROS; i++) {
+        const double small = small_zero(m, zero_theta[i], least);
+        const double step = small < INFINITY ? exp2(floor(log2(CALIBRATION_FURTHER * small))) : 1;
+        s->off[zero_theta[i]] = rint(theta[zero_theta[i]] / step) * step;
+    }
     return moved;
 }
 

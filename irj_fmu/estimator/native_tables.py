@@ -313,6 +313,7 @@ def _calibration_tables(header: _Header, made: OnlineEstimator) -> None:
     header.whole("zero_theta", own.zeros)
     header.define("MOST_LATE", float(own.most))
     header.define("NEAR_LATE", float(own.near))
+    header.define("LATE_PART", float(own.part))
     header.define("CALIBRATION_ROUNDS", ROUNDS)
     header.define("CALIBRATION_FURTHER", FURTHER)
     header.define("CALIBRATION_SURE", float(SURE))

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from benchmarks.native import hurt, readings_of
+from benchmarks.native import hurt, readings_of, skewed
 from identification.data.joint_file import Joint, Known, load_joint, toml_text
 from identification.errors import InputError
 from identification.faults.detector import FaultDetector
@@ -335,11 +335,7 @@ def test_equals_python_where_sensors_have_a_zero_and_skews(kind: str, tmp_path: 
     built = 4 * STEP
     options = replace(PLAIN, detect=False)
     spec = NativeSpec(joint, "native", options, sample_time=built)
-    readings = readings_of("hd3", 8.0)[::4]
-    late = readings[10:].copy()
-    late[:, 3:5] = 0.4 * readings[8:-2, 3:5] + 0.6 * readings[7:-3, 3:5]
-    late[:, 3] += 2e-3
-    late[:, 5] = 0.7 * readings[9:-1, 5] + 0.3 * readings[10:, 5]
+    late = skewed(readings_of("hd3", 8.0)[::4])
     reset = {len(late) // 2: (("Boolean", "reset", True),)}
     path = build_native(spec, tmp_path / "native.fmu")
     given = {"warm_up": 1.5}
