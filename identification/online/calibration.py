@@ -3,7 +3,7 @@ little, taken off the readings before the recursion starts.
 
 A zero between the encoders and skews between the clocks have columns of their own in the rows, the
 derivatives at the values of the joint file. That is a straight line, good for a small skew only:
-of two samples, inertia and stiffness came out 20 to 30 % off. So what the first window says is
+of two samples, half its square is no small part. So what the first window says is
 taken off its readings and its rows are made again until no more comes out, as
 :mod:`identification.balance.clocks` shifts the channels of a record; a zero is taken off where a
 law of the twist is bent. The drive stays as it is: most are late through a low-pass, which the rate
@@ -30,7 +30,6 @@ ROUNDS: Final = 8
 """Times that the rows are made again at most, at the values of the joint file and then with all
 free, as many as :mod:`identification.balance.calibration` takes: under a straight spring two, under
 a cubic one three samples, which are more than its whole twist, take six."""
-
 
 FURTHER: Final = 0.1
 """Share of what is too little to make rows again at which it ends once they are."""

@@ -212,6 +212,7 @@ class OnlineEstimator:
             self.two_step.reset()
         if self.detector is not None:
             self.detector.reset()
+        self.samples.reset()
         self._align()
         self._collected: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         self._heard: list[tuple[float, float, float, float]] = []
@@ -437,7 +438,8 @@ class OnlineEstimator:
         """Keep the readings of the first window, as far as there is room: to make its rows again
         where the sensors are off.
         """
-        if self.estimator is not None or not self.calibration or self._now.rows and not self._heard:
+        given_up = self._now.rows > 0 and not self._heard
+        if self.estimator is not None or given_up or not self.calibration:
             return
         self._heard.append(sample)
         if len(self._heard) > self.room_of(self.collect):

@@ -155,3 +155,14 @@ def test_a_state_saved_between_two_windows_goes_on_as_if_never_saved() -> None:
     one.reset()
     assert not one.calibration.off.any()
     assert one.samples.lag == 0.0
+
+
+def test_a_reset_forgets_which_readings_were_lost() -> None:
+    """As the native estimator does: the next run is not shorter for the end of the last."""
+    time, table = recorded("straight", 0.0, 0.0, 0.0)
+    one = OnlineEstimator(reference_joint("hd3"), DT, UNWATCHED)
+    for at, row in zip(time[:200].tolist(), table[:200].tolist(), strict=True):
+        one.update(at, row, [True, True, True, False, True, True])
+    assert one.samples.lost.any()
+    one.reset()
+    assert not one.samples.lost.any()
