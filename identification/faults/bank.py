@@ -133,6 +133,14 @@ class FaultBank:
                 "fault bank: the model is rigid; it needs motor and link apart "
                 "(transmission_compliance)"
             )
+        values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+        stiffness = model.stiffness_name
+        if stiffness is not None and not values[stiffness] > 0.0:
+            raise InputError(
+                f"fault bank: {stiffness} is {values[stiffness]:g} in the joint file, so that "
+                "nothing ties motor and link; fit it to records that show it, or use a rigid model "
+                "(hd1, hd2)"
+            )
         if not measured[CURRENT] or not (measured[1] and measured[3]):
             raise InputError(
                 "fault bank: it needs the drive and the positions of motor and link; "

@@ -143,6 +143,9 @@ def test_all_readings_dead_at_once_is_no_sensor(
 def test_what_it_cannot_work_with_is_said() -> None:
     with pytest.raises(InputError, match="rigid"):
         FaultBank(JointModel.by_name("hd1", -160.0), DT, THERE)
+    slack = plant().with_values({"stiffness": 0.0})
+    with pytest.raises(InputError, match="stiffness is 0"):
+        FaultBank(slack, DT, THERE)
     with pytest.raises(InputError, match="positions of motor and link"):
         FaultBank(plant(), DT, (True, True, False, False, False, True))
     made = FaultBank(plant(), DT, THERE)
