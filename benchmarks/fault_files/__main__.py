@@ -1,11 +1,12 @@
 """Sensor faults in files: what the fault bank sees and names where no velocity is measured.
 
     python -m benchmarks.fault_files --cases 140 [--joints 3] [--first 100] [--hours 2]
-        [--keep results.json]
+        [--velocities] [--keep results.json]
 
 Every joint is another one, drawn by the generator of `tests/hidden_effect` (true sticking,
 unmodelled bump, snags, kinematic error of an odd order and a stiff link mode in every record).
-Files have time, motor current, both positions and the link torque. `irj improve` makes the model
+Files have time, motor current, both positions and the link torque, with `--velocities` both
+velocities too. `irj improve` makes the model
 from two training files of 24 s; limits come from two other healthy files; faults are put into files
 of a motion that nobody has seen. Case numbers decide sensor, kind, sign, and time. `--keep` adds to
 what is there, so that a campaign can be run in pieces. Printed: share detected, share in which the
@@ -38,6 +39,7 @@ from identification.data.read import read
 from identification.data.record import Record
 from identification.faults.bank import FaultBank
 from identification.faults.bank_levels import Piece
+from identification.faults.core import SENSORS as SENSOR_NAMES
 from identification.faults.injector import Fault, inject
 from identification.faults.types import FaultEvent, Verdict
 from irj_fmu.estimator.bank import bank_for, judged
@@ -48,27 +50,30 @@ from workbench.cli.main import main as irj
 
 FloatArray = npt.NDArray[np.float64]
 
-KEPT: Final = (0, 1, 2, 4, 6)
-"""Columns of the files: time, current, motor position, link position, torque."""
+VELOCITIES: Final = (3, 5)
+"""Columns of the generator that are not in the files as a rule."""
 SENSORS: Final = {
     "current": 1,
     "motor_position": 2,
     "link_position": 4,
     "torque": 6,
+    "motor_velocity": 3,
+    "link_velocity": 5,
 }
+"""Columns of the generator; the last two with ``--velocities``."""
 HIDDEN: Final = (None, "stribeck", "kinematic_error", "torque_ripple", "cubic_stiffness")
 """What `improve` has to find; joints take turns."""
-SIZES: Final[dict[str, tuple[float, float]]] = {
-    "bias": (15.0, 0.010),
-    "drift": (5.0, 0.005),
-    "gain": (0.30, 0.05),
-    "noise": (50.0, 0.1),
-    "spike": (60.0, 0.010),
-    "stuck": (0.0, 0.0),
-    "dropout": (0.0, 0.0),
+SIZES: Final[dict[str, tuple[float, float, float]]] = {
+    "bias": (15.0, 0.010, 0.05),
+    "drift": (5.0, 0.005, 0.05),
+    "gain": (0.30, 0.05, 0.2),
+    "noise": (50.0, 0.1, 0.1),
+    "spike": (60.0, 0.010, 0.2),
+    "stuck": (0.0, 0.0, 0.0),
+    "dropout": (0.0, 0.0, 0.0),
 }
-"""Size for the two torques [N.m, N.m/s, share] and for the two positions, link-referred [rad,
-rad/s, share]."""
+"""Size for the two torques [N.m, N.m/s, share], for the two positions, link-referred [rad, rad/s,
+share], and for the two velocities [rad/s, rad/s2, share]."""
 SPAN: Final = 120.0
 """Length of the healthy files and of those that faults are put into [s]."""
 CHANGES: Final[Mapping[str, Mapping[str, float]]] = {
@@ -102,9 +107,21 @@ class Bench:
     changed: Mapping[str, FloatArray]
     ratio: float
 
+    @property
+    def sensors(self) -> list[str]:
+        """What the files have, that faults are put into."""
+        return [n for n in SENSORS if SENSOR_NAMES.index(n) in self.bank.sensors]
 
-def _file(path: Path, table: FloatArray) -> Path:
-    columns: dict[str, Any] = {COLUMNS[i]: table[:, i] for i in KEPT}
+    @property
+    def velocities(self) -> bool:
+        """Whether the files have velocities."""
+        return "motor_velocity" in self.sensors
+
+
+def _file(path: Path, table: FloatArray, velocities: bool) -> Path:
+    columns: dict[str, Any] = {
+        name: table[:, i] for i, name in enumerate(COLUMNS) if velocities or i not in VELOCITIES
+    }
     np.savez(path, **columns)
     return path
 
@@ -115,14 +132,14 @@ def opened(path: Path, joint: Joint) -> Record:
 
 
 @cache
-def bench(seed: int, folder: Path) -> Bench:
-    """The joint of a seed."""
+def bench(seed: int, folder: Path, velocities: bool = False) -> Bench:
+    """The joint of a seed, its files with velocities or without."""
     hidden = HIDDEN[seed % len(HIDDEN)]
     here = folder / str(seed)
     here.mkdir(parents=True, exist_ok=True)
     short = simulate_case(hidden, seed, dirt=True)
-    train = [_file(here / f"{n}.npz", short.measured[n]) for n in ("train", "train2")]
-    held = [_file(here / f"{n}.npz", short.measured[n]) for n in ("test", "test2")]
+    train = [_file(here / f"{n}.npz", short.measured[n], velocities) for n in ("train", "train2")]
+    held = [_file(here / f"{n}.npz", short.measured[n], velocities) for n in ("test", "test2")]
     (here / "joint.toml").write_text(
         f'[joint]\nname = "joint {seed}"\ngear_ratio = {short.gear_ratio}\n'
         f"motor_constant = {KM}   # Nm/A on the motor shaft\n"
@@ -134,7 +151,9 @@ def bench(seed: int, folder: Path) -> Bench:
         given = ["improve", *map(str, train), "--held-out", *map(str, held)]
         irj([*given, "--joint", str(here / "joint.toml"), "-o", str(better)])
     long = simulate_case(hidden, seed, dirt=True, span=SPAN)
-    healthy = [_file(here / f"healthy_{n}.npz", long.measured[n]) for n in ("train", "test")]
+    healthy = [
+        _file(here / f"healthy_{n}.npz", long.measured[n], velocities) for n in ("train", "test")
+    ]
     joint = load_joint(better)
     records = [opened(p, joint) for p in healthy]
     bank = bank_for(joint, records[0], records)
@@ -168,9 +187,11 @@ def bench(seed: int, folder: Path) -> Bench:
 def faulty(at: Bench, number: int) -> tuple[FloatArray, Fault]:
     """A piece of the unseen record with a fault; the number of the case decides which."""
     rng = np.random.default_rng([7, number])
-    names, kinds = list(SENSORS), list(SIZES)
+    names, kinds = at.sensors, list(SIZES)
     sensor, kind = names[number % len(names)], kinds[(number // len(names)) % len(kinds)]
-    size = SIZES[kind][int(sensor.endswith("position"))]
+    size = SIZES[kind][
+        1 if sensor.endswith("position") else 2 if sensor.endswith("velocity") else 0
+    ]
     return piece(at, rng, sensor, kind, size)
 
 
@@ -186,9 +207,10 @@ def piece(
     begin = DT * round(rng.uniform(5.0, 8.0) / DT)
     fault = Fault(sensor, kind, begin, size)  # type: ignore[arg-type]
     column = SENSORS[sensor]
-    referred = {"current": at.ratio * KM, "motor_position": 1.0 / at.ratio}.get(sensor, 1.0)
+    motor = {"current": at.ratio * KM} | dict.fromkeys(SENSOR_NAMES[1:3], 1.0 / at.ratio)
+    referred = motor.get(sensor, 1.0)
     rows = np.zeros((count, 6))
-    place = {"current": 0, "motor_position": 1, "link_position": 3, "torque": 5}[sensor]
+    place = SENSOR_NAMES.index(sensor)
     rows[:, place] = referred * table[:, column]
     table[:, column] = (
         inject(rows, DT, [fault], seed=int(rng.integers(1 << 30)))[:, place] / referred
@@ -199,7 +221,7 @@ def piece(
 def judge(at: Bench, number: int) -> dict[str, Any]:
     """One case."""
     table, fault = faulty(at, number)
-    path = _file(at.folder / "case.npz", table)
+    path = _file(at.folder / "case.npz", table, at.velocities)
     record = opened(path, at.joint)
     track = judged(at.bank, record, at.joint)
     late = [e for e in track.events if record.time[e.sample] >= fault.start - DT / 2]
@@ -232,7 +254,7 @@ def names_sensor(event: FaultEvent) -> bool:
 
 def said_about(at: Bench, table: FloatArray) -> tuple[float, list[str]]:
     """Hours of a record, and what was said about it."""
-    record = opened(_file(at.folder / "healthy.npz", table), at.joint)
+    record = opened(_file(at.folder / "healthy.npz", table, at.velocities), at.joint)
     track = judged(at.bank, record, at.joint)
     return record.duration / 3600.0, [
         f"{record.time[e.sample]:.2f} s {e.verdict.name} {' '.join(e.sensors)}".strip()
@@ -265,7 +287,7 @@ def aside(at: Bench, hours_more: float) -> dict[str, Any]:
         for what, size in (("seen", seen), ("quarter", seen / 4), ("named", named)):
             for _ in range(3 if np.isfinite(size) else 0):
                 table, fault = piece(at, rng, sensor, "bias", size)
-                record = opened(_file(at.folder / "size.npz", table), at.joint)
+                record = opened(_file(at.folder / "size.npz", table, at.velocities), at.joint)
                 events = [
                     e
                     for e in judged(at.bank, record, at.joint).events
@@ -326,6 +348,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--seconds", type=float, default=330.0, help="stop after so many seconds")
     parser.add_argument("--folder", type=Path, help="keep joints and files here")
+    parser.add_argument("--velocities", action="store_true", help="files have velocities too")
     parser.add_argument("--keep", type=Path)
     options = parser.parse_args(arguments)
     folder = options.folder or Path(tempfile.mkdtemp(prefix="fault-files-"))
@@ -341,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if time.monotonic() - begin > options.seconds:
             print("time is up; run again with --keep to go on")
             break
-        at = bench(seed, folder)
+        at = bench(seed, folder, options.velocities)
         if str(seed) not in results["healthy"]:
             results["healthy"][str(seed)] = aside(at, options.hours / options.joints)
         found = judge(at, number)

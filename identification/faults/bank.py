@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.errors import InputError
+from identification.faults.bank_clocks import aligned, inside
 from identification.faults.bank_levels import SETTLE, Piece, first_levels, likeliest
 from identification.faults.bank_spring import OPENED, STIFFNESS, SpringFilters, opened
 from identification.faults.bank_statistics import WINDOWS, limits, statistics
@@ -29,7 +30,8 @@ from identification.faults.core import (
     TORQUE,
 )
 from identification.faults.types import FaultEvent, Verdict
-from identification.online.filter import FilterState, JointFilter, Levels
+from identification.online.filter import Doubts, FilterState, JointFilter, Levels
+from identification.online.filter_step import BALANCES
 from identification.online.pulse import Pulse
 
 FloatArray = npt.NDArray[np.float64]
@@ -118,6 +120,10 @@ class FaultBank:
         from its position is none.
     tuning : Tuning, optional
         From another bank of this joint; :meth:`calibrate` makes it.
+    doubts : Doubts, optional
+        Errors of the model's parameters, as its fit states them.
+    late : sequence of 6 floats, optional
+        Time by which each reading is late against the motor position [s].
 
     Attributes
     ----------
@@ -126,7 +132,14 @@ class FaultBank:
     """
 
     def __init__(
-        self, model: JointModel, dt: float, measured: Sequence[bool], tuning: Tuning | None = None
+        self,
+        model: JointModel,
+        dt: float,
+        measured: Sequence[bool],
+        tuning: Tuning | None = None,
+        *,
+        doubts: Doubts = Doubts(),  # noqa: B008 - frozen
+        late: Sequence[float] = (0.0,) * len(SENSORS),
     ) -> None:
         if not model.is_elastic:
             raise InputError(
@@ -150,8 +163,10 @@ class FaultBank:
         self.sensors = tuple(i for i in range(len(SENSORS)) if self.measured[i])
         self.dt = dt
         free = replace(model, calibration=CALIBRATION)
-        self.joint = JointFilter(free, dt, CALIBRATION)
-        self.springs = SpringFilters(free, dt, CALIBRATION)
+        self.joint = JointFilter(free, dt, CALIBRATION, doubts=doubts)
+        self.known = JointFilter(free, dt, CALIBRATION)
+        self.springs = SpringFilters(free, dt, CALIBRATION, doubts)
+        self.late = tuple(float(x) for x in late)
         self.tuning = tuning
 
     # --- before the run ---------------------------------------------------------------------------
@@ -167,14 +182,14 @@ class FaultBank:
         size = max(round(CHUNK / self.dt), 1)
         cut = [
             Piece(p.time[k : k + size], p.rows[k : k + size])
-            for p in healthy
+            for p in map(self.in_time, without_gaps(healthy))
             for k in range(0, len(p.time), size)
         ]
         long = [p for p in cut if p.time[-1] - p.time[0] > 2 * SETTLE]
         if not long:
             raise InputError(f"fault bank: give healthy records longer than {2 * SETTLE:g} s")
         first = first_levels(long, self.dt, self.measured)
-        levels = likeliest(self.joint, long, self.measured, first)
+        levels = likeliest(self.known, long, self.measured, first)
         flags = self.flags(1)[:, 0]
         found = []
         for k in range(len(flags)):
@@ -212,14 +227,20 @@ class FaultBank:
         tuning = self.tuned
         clean = np.where(np.abs(rows) < ABSURD, rows, np.nan)
         dead = self.dead(time, np.nan_to_num(clean))
-        work = _Work(self, tuning, time, np.where(dead[:, None], np.nan, clean), dead)
+        given = np.where(dead[:, None], np.nan, clean)
+        work = _Work(self, tuning, time, given, dead)
         work.go()
         return BankTrack(
             tuple(sorted(work.events, key=lambda e: e.sample)),
             work.failed,
-            work.readings,
+            np.where(work.failed, work.readings, given),
             work.scores,
         )
+
+    def in_time(self, piece: Piece) -> Piece:
+        """A stretch without gaps, its late readings at their own time."""
+        rows, part = aligned(piece.time, piece.rows, self.late), inside(piece.time, self.late)
+        return Piece(piece.time[part], rows[part])
 
     def smallest(self, healthy: Piece) -> dict[str, tuple[float, float]]:
         """The smallest offset of each sensor that is seen, and the smallest that is named, in the
@@ -227,7 +248,8 @@ class FaultBank:
 
         Bisected on a healthy record, at some times of its motion, and times :data:`ANNOUNCED`.
         """
-        time, rows = healthy.time, healthy.rows
+        piece = self.in_time(max(without_gaps([healthy]), key=lambda p: len(p.time)))
+        time, rows = piece.time, piece.rows
         places = [
             int(np.searchsorted(time, time[0] + share * (time[-1] - time[0])))
             for share in (0.35, 0.65, 0.9)
@@ -331,6 +353,15 @@ class FaultBank:
         )
 
 
+def without_gaps(pieces: Sequence[Piece]) -> list[Piece]:
+    """Stretches between the gaps, which start the filters anew."""
+    out = []
+    for p in pieces:
+        edges = [0, *(np.flatnonzero(np.diff(p.time) > GAP) + 1).tolist(), len(p.time)]
+        out += [Piece(p.time[a:b], p.rows[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return out
+
+
 def told(worst: FloatArray) -> int | None:
     """The sensor whose filter alone is innocent, by the largest scores of the filters without one
     sensor each; None where several are, or none.
@@ -416,7 +447,13 @@ class _Work:
         edges = [0, *cut.tolist(), len(self.time)]
         for first, last in zip(edges[:-1], edges[1:], strict=True):
             if last > first and not self.dead[first]:
-                self._stretch(first, last)
+                time, late = self.time[first:last], self.bank.late
+                there = aligned(time, self.rows[first:last], late)
+                missing = np.isnan(self.rows[first:last])
+                self.rows[first:last] = self.readings[first:last] = np.where(missing, np.nan, there)
+                part = inside(time, late)
+                if part.stop > part.start:
+                    self._stretch(first + part.start, first + part.stop)
 
     def _missing(self) -> None:
         """Readings that are not there are said at once."""
@@ -534,11 +571,12 @@ class _Work:
         """A filter with the calibration that another one has found: without a position nothing
         tells its encoder's zero, and a bias would pass for one.
         """
-        count = len(self.bank.joint.names)
+        first = self.bank.joint.states + BALANCES
+        own = slice(first, first + self.bank.joint.free)
         mean, covariance = state.mean.copy(), state.covariance.copy()
-        mean[-count:] = known.mean[-count:]
-        covariance[-count:, :] = covariance[:, -count:] = 0.0
-        covariance[-count:, -count:] = known.covariance[-count:, -count:]
+        mean[own] = known.mean[own]
+        covariance[own, :] = covariance[:, own] = 0.0
+        covariance[own, own] = known.covariance[own, own]
         return replace(state, mean=mean, covariance=covariance)
 
     def _decide(

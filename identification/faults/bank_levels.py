@@ -132,7 +132,8 @@ def likeliest(
                     break
         return least, best
 
-    turns = replace(first, creeping=(float(joint.dry[0]), float(joint.dry[1])))
+    dry = (float(joint.dry[0]), float(joint.dry[1]))
+    turns = replace(first, creeping=dry, holding=dry)
     roughly = [climbed(start, STEPS[:1], ROUGHLY) for start in _starts(turns)]
     _, rough = min(roughly, key=lambda found: found[0])
     _, best = climbed(rough, STEPS, 1)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from casadi_models import JointModel
 from identification.faults.bank_statistics import statistics
-from identification.online.filter import TWIST, FilterState, JointFilter, Levels
+from identification.online.filter import TWIST, Doubts, FilterState, JointFilter, Levels
 from identification.online.filter_step import BALANCES
 
 FloatArray = npt.NDArray[np.float64]
@@ -67,11 +67,17 @@ class SpringFilters:
         Usual sample time [s].
     calibration : sequence of str
         The encoders' zero.
+    doubts : Doubts
+        Of the bank's filters.
     """
 
-    def __init__(self, model: JointModel, dt: float, calibration: Sequence[str]) -> None:
+    def __init__(
+        self, model: JointModel, dt: float, calibration: Sequence[str], doubts: Doubts
+    ) -> None:
         name = [] if model.stiffness_name is None else [model.stiffness_name]
-        self.joint = JointFilter(model, dt, (*calibration, *name), reciprocal=name)
+        others = doubts.without(model.stiffness_name)
+        self.joint = JointFilter(model, dt, (*calibration, *name), name, others)
+        self.given = (*calibration, *doubts.names)
 
     def explain(
         self,
@@ -100,7 +106,8 @@ class SpringFilters:
         states = []
         for zero, spring in ((OPENED, 0.0), (0.0, CHANGED), (OPENED, CHANGED)):
             one = opened(self.joint, wide, levels, zero)
-            one.covariance[-1, -1] = (spring * one.mean[-1]) ** 2
+            at = self._at_stiffness
+            one.covariance[at, at] = (spring * one.mean[at]) ** 2
             states.append(self._at_readings(one))
         used = np.tile(np.array(measured, dtype=np.float64), (len(states), len(time), 1))
         course = self.joint.run(states, time, rows, used, levels=levels)
@@ -130,7 +137,8 @@ class SpringFilters:
         if not np.isfinite(found.mean).all():
             return state
         mean[LINK_STATE] -= found.mean[zero] - mean[zero]
-        mean[zero:] = found.mean[zero:]
+        free = slice(zero, zero + self.joint.free)
+        mean[free] = found.mean[free]
         return replace(state, mean=mean)
 
     def _with_stiffness(self, state: FilterState) -> FilterState:
@@ -138,7 +146,23 @@ class SpringFilters:
         linear in the compliance; in the stiffness or its logarithm the filter would follow a
         curve, and take that for knowledge.
         """
-        known, size = 1 / self.joint.values[self.joint.names[-1]], len(state.mean)
-        covariance = np.zeros((size + 1, size + 1))
-        covariance[:size, :size] = state.covariance
-        return replace(state, mean=np.append(state.mean, known), covariance=covariance)
+        first, at = self.joint.states + BALANCES, self._at_stiffness
+        own = list(range(first + len(self.given)))
+        kept = own[:first] + [
+            first + self.given.index(n)
+            for n in self.joint.names
+            if first + self.joint.names.index(n) != at
+        ]
+        places = [k for k in range(self.joint.size) if k != at]
+        mean, covariance = np.zeros(self.joint.size), np.zeros((self.joint.size,) * 2)
+        mean[places], mean[at] = (
+            state.mean[kept],
+            1 / self.joint.values[self.joint.names[at - first]],
+        )
+        covariance[np.ix_(places, places)] = state.covariance[np.ix_(kept, kept)]
+        return replace(state, mean=mean, covariance=covariance)
+
+    @property
+    def _at_stiffness(self) -> int:
+        """Its place in the state: the last one of the free parameters."""
+        return self.joint.states + BALANCES + self.joint.free - 1

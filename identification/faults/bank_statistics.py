@@ -29,6 +29,13 @@ SIGMAS: Final = 5.5
 UNSURE: Final = 3.0
 """Standard deviations by which a disturbance may be off: while an encoder's zero is not known yet,
 a disturbance of the transmission is not either."""
+SURE: Final = 1.645
+"""Standard errors of that quantile by which it may be larger than the blocks say, one in twenty:
+forty seconds have twenty blocks, whose spread is known to a fifth."""
+MOMENTS: Final = (1.1589, 0.1919, 1.1)
+"""Variance of a Gumbel quantile from the mean and the deviation of n blocks, by powers of its
+reduced variate, in squares of the scale over n (Kite, Frequency and Risk Analyses in Hydrology,
+1977)."""
 EULER: Final = 0.5772156649
 """Mean of the standard Gumbel distribution."""
 
@@ -110,7 +117,7 @@ def limits(
     levels of the disturbances [N.m].
 
     The larger of :data:`LARGEST` times the largest value and of the Gumbel quantile of the largest
-    values of blocks, times :data:`MARGIN`.
+    values of blocks, as large as it may be by so many blocks, times :data:`MARGIN`.
     """
     size = max(1, round(BLOCK / dt))
     blocks = np.array(
@@ -122,7 +129,8 @@ def limits(
     )
     scale = np.std(blocks, axis=0) * math.sqrt(6) / math.pi
     rare = -math.log(-math.log1p(-ALARMS * BLOCK / 3600.0))
-    quantile = np.mean(blocks, axis=0) + (rare - EULER) * scale
+    unsure = math.sqrt(sum(c * rare**k for k, c in enumerate(MOMENTS)) / len(blocks))
+    quantile = np.mean(blocks, axis=0) + (rare - EULER + SURE * unsure) * scale
     found = MARGIN * np.maximum(LARGEST * blocks.max(axis=0), quantile)
     kept: FloatArray = np.maximum(found, floors(dt, disturbance, readings))
     return kept

@@ -92,7 +92,12 @@ class Fault:
 
 
 def inject(
-    readings: npt.ArrayLike, dt: float, faults: Sequence[Fault], *, seed: int = 0
+    readings: npt.ArrayLike,
+    dt: float,
+    faults: Sequence[Fault],
+    *,
+    seed: int = 0,
+    time: FloatArray | None = None,
 ) -> FloatArray:
     """Readings with faults.
 
@@ -101,12 +106,15 @@ def inject(
     readings : (n, 6) array
         Healthy readings in the order of :data:`identification.faults.detector.SENSORS`.
     dt : float
-        Sample time [s].
+        Usual sample time [s].
     faults : sequence of Fault
         Single, staggered, simultaneous or temporary ones; each acts on the healthy reading, the
         last one wins where two hold the same sensor at the same time.
     seed : int
         Of noise and spikes.
+    time : (n,) array, optional
+        Stamps [s] of samples that come unevenly, or of which some were lost; the faults' times
+        count from the first one.
 
     Returns
     -------
@@ -118,40 +126,47 @@ def inject(
         raise InputError(f"inject: readings have shape {healthy.shape}; give (n, {len(SENSORS)})")
     out = healthy.copy()
     rng = np.random.default_rng(seed)
+    stamps = dt * np.arange(len(out)) if time is None else time - time[0]
+    since = np.asarray(stamps, dtype=np.float64)
     for fault in faults:
-        first = max(0, round(fault.start / dt))
-        last = len(out) if np.isinf(fault.end) else min(len(out), round(fault.end / dt))
+        first, last = np.searchsorted(since + dt / 2, (fault.start, fault.end), side="right")
         if first < last:
             column = SENSORS.index(fault.sensor)
-            out[first:last, column] = _faulty(healthy[:, column], first, last, fault, dt, rng)
+            out[first:last, column] = _faulty(
+                healthy[:, column], slice(int(first), int(last)), fault, since, rng
+            )
     return out
 
 
 def _faulty(
-    channel: FloatArray, first: int, last: int, fault: Fault, dt: float, rng: np.random.Generator
+    channel: FloatArray, rows: slice, fault: Fault, time: FloatArray, rng: np.random.Generator
 ) -> FloatArray | float:
-    part, count = channel[first:last], last - first
+    part, first = channel[rows], rows.start
     if fault.kind == "noise":
-        return rng.normal(0.0, fault.size, count)
+        return rng.normal(0.0, fault.size, len(part))
     if fault.kind == "stuck":
         return float(channel[max(first - 1, 0)])
     if fault.kind == "zero":
         return 0.0
     if fault.kind == "dropout":
         return float("nan")
+    step = np.diff(time, prepend=2 * time[0] - time[min(1, len(time) - 1)])[rows]
     if fault.kind == "spike":
-        hit = rng.random(count) < SPIKES * dt
+        hit = rng.random(len(part)) < SPIKES * step
         hit[0] = True
-        spiked: FloatArray = part + np.where(hit, fault.size * rng.choice([-1.0, 1.0], count), 0.0)
+        signs = rng.choice([-1.0, 1.0], len(part))
+        spiked: FloatArray = part + np.where(hit, fault.size * signs, 0.0)
         return spiked
     if fault.kind == "delay":
-        late = max(1, round(fault.size / dt))
-        delayed: FloatArray = channel[np.maximum(np.arange(first, last) - late, 0)]
+        usual = float(np.median(step))
+        then = np.searchsorted(time, time[rows] - fault.size + usual / 2, side="right") - 1
+        before = np.arange(rows.start, rows.stop) - 1
+        delayed: FloatArray = channel[np.maximum(np.minimum(then, before), 0)]
         return delayed
     changed = {
         "bias": part + fault.size,
         "gain": part * (1.0 + fault.size),
-        "drift": part + fault.size * dt * np.arange(1, count + 1),
+        "drift": part + fault.size * np.cumsum(step),
     }
     found: FloatArray = changed[fault.kind]
     return found

@@ -8,7 +8,7 @@ functions; the step runs interpreted or as generated C (:class:`identification.f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final, final
 
@@ -35,6 +35,9 @@ LONGEST_STEP: Final = 1e-3
 over inertia is some 1000 1/s at zero velocity."""
 SHORTEST: Final = 1e-9
 """Shortest time between two samples [s]: stamps that repeat give no infinite noise."""
+BRIDGED: Final = 0.1
+"""Longest gap between stamps over which the drive is taken for a straight line [s], sample by
+sample; over longer ones the drive is not known at all."""
 MOST_DECAY: Final = 2.0
 """Largest rate of the linearised joint times the step: at 2 the implicit midpoint takes a velocity
 to zero in one step, above it the velocity would change its sign every step."""
@@ -51,6 +54,9 @@ KNOWN: Final = 1e-3
 """Share of its level to which a disturbance is known at the best: readings have noise."""
 SLOW: Final = 3.0
 """Smoothing velocities below which a side counts as standing or turning."""
+MOST_DOUBT: Final = 0.5
+"""Largest standard deviation of the logarithm of a doubtful parameter: the exponential of twice
+that is 2.7, and no straight line."""
 MOTOR, TRANSMISSION, LINK = range(3)
 
 
@@ -77,6 +83,8 @@ class Levels:
     creeping : tuple of 2 floats
         Standard deviation of what the friction of motor and link is wrong by while that side creeps
         through a turn [N.m].
+    holding : tuple of 2 floats
+        Standard deviation of the friction that holds a side that stands [N.m]: it lasts as long.
     clip : float
         Innovations beyond this many standard deviations weigh less (Huber).
     """
@@ -89,6 +97,7 @@ class Levels:
     unknown_lasting: float = 0.05
     shift: float = 0.0
     creeping: tuple[float, float] = (0.0, 0.0)
+    holding: tuple[float, float] = (0.0, 0.0)
     clip: float = 4.0
 
     def vector(self) -> list[float]:
@@ -102,8 +111,30 @@ class Levels:
             self.unknown_lasting,
             self.shift,
             *self.creeping,
+            *self.holding,
             self.clip,
         ]
+
+
+@final
+@dataclass(frozen=True)
+class Doubts:
+    """Parameters that a filter takes as they are, but not for sure.
+
+    Attributes
+    ----------
+    names : tuple of str
+    covariance : (p, p) array
+        Of their values, as of a fit.
+    """
+
+    names: tuple[str, ...] = ()
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def without(self, name: str | None) -> Doubts:
+        """The others, were the one known."""
+        kept = [i for i, n in enumerate(self.names) if n != name]
+        return Doubts(tuple(self.names[i] for i in kept), self.covariance[np.ix_(kept, kept)])
 
 
 @final
@@ -163,6 +194,17 @@ class Course:
     used_drive: bool
     last: tuple[FilterState, ...]
 
+    def at(self, rows: npt.NDArray[np.intp]) -> Course:
+        """What the filters did in some of the samples."""
+        return replace(
+            self,
+            innovation=self.innovation[:, rows],
+            spread=self.spread[:, rows],
+            disturbance=self.disturbance[:, rows],
+            deviation=self.deviation[:, rows],
+            states=self.states[:, rows],
+        )
+
 
 @final
 class JointFilter:
@@ -179,11 +221,16 @@ class JointFilter:
     reciprocal : sequence of str
         Those of them that stand in the state as one over their value: a stiffness that may be far
         off, whose twist is linear in that.
+    doubts : Doubts
+        Parameters that are not estimated, and whose errors count as what they do to the readings
+        (Schmidt's filter): a joint that was fitted at one speed is known less well at another.
 
     Attributes
     ----------
     names : tuple of str
-        The free parameters.
+        The free parameters, then the doubtful ones.
+    free : int
+        How many are free.
     logarithmic : tuple of bool
         Which of them stand in the state as logarithms: inertias, and what the transmission is made
         of and cannot be negative, where they are positive at the start.
@@ -197,13 +244,15 @@ class JointFilter:
         dt: float,
         free: Sequence[str] = (),
         reciprocal: Sequence[str] = (),
+        doubts: Doubts = Doubts(),  # noqa: B008 - frozen
     ) -> None:
-        unknown = sorted(set(free) - set(model.parameter_names))
+        unknown = sorted({*free, *doubts.names} - set(model.parameter_names))
         if unknown:
             raise InputError(f"filter: the model has no parameter {', '.join(unknown)}")
         if not (np.isfinite(dt) and dt > 0):
             raise InputError(f"filter: the sample time is {dt!r}; give a positive number of s")
-        self.model, self.dt, self.names = model, dt, tuple(free)
+        self.model, self.dt, self.names = model, dt, (*free, *doubts.names)
+        self.free = len(free)
         self.functions = JointFunctions(model, open_to_disturbances=True)
         self.states = len(self.functions.state_names) + len(self.functions.memory_names)
         self.size = self.states + BALANCES + len(self.names)
@@ -227,6 +276,7 @@ class JointFilter:
         self.values = self._followable(values)
         self.walks = np.zeros(len(self.names))
         self.dry, self.slow = self._dry_friction()
+        self.doubtful = self._entries(doubts)
 
     # --- what the step is made from ---------------------------------------------------------------
 
@@ -263,6 +313,16 @@ class JointFilter:
             dry.append(max(2 * jump[0] - jump[1], 0.0))
         return AT_A_TURN * np.array(dry), np.full(2, SLOW * width)
 
+    def _entries(self, doubts: Doubts) -> FloatArray:
+        """Covariance of the doubtful parameters as they stand in the state."""
+        per_value = np.ones(len(doubts.names))
+        for k, name in enumerate(doubts.names):
+            if self.logarithmic[self.free + k]:
+                spread = float(np.sqrt(doubts.covariance[k, k]))
+                # where the logarithm is no straight line any more its error is cut
+                per_value[k] = 1 / max(self.values[name], spread / MOST_DOUBT)
+        return np.asarray(doubts.covariance * np.outer(per_value, per_value), dtype=np.float64)
+
     def _rate(self, state: int, speed: float, push: tuple[float, float] = (0.0, 0.0)) -> float:
         """Acceleration of a side at a speed, with torques on motor and link."""
         x = np.zeros(self.states)
@@ -283,7 +343,7 @@ class JointFilter:
     @cached_property
     def update(self) -> Any:
         """See :func:`identification.online.filter_step.update_function`."""
-        return update_function(self.functions, self.model, self.names, self._forms)
+        return update_function(self.functions, self.model, self.names, self._forms, self.free)
 
     @property
     def _forms(self) -> tuple[Form, ...]:
@@ -390,7 +450,9 @@ class JointFilter:
             if self.reciprocal[k]:
                 mean[at + BALANCES + k] = 1 / given[name]
                 variance[at + BALANCES + k] /= given[name] ** 4
-        return FilterState(mean, np.diag(variance), time - self.dt, float(readings[0]))
+        covariance, doubtful = np.diag(variance), slice(at + BALANCES + self.free, None)
+        covariance[doubtful, doubtful] = self.doubtful
+        return FilterState(mean, covariance, time - self.dt, float(readings[0]))
 
     def step(
         self,
@@ -429,7 +491,21 @@ class JointFilter:
         used : (filters, n, 6) array
             0: the reading is not used by the filter.
         levels : Levels, optional
+
+        Notes
+        -----
+        Samples that were lost are predicted one by one, with the drive in between: a step over many
+        of them would follow no turn of a friction law, and would weigh the drive before and after
+        as if they were one sample apart.
         """
+        full, kept = _bridged(np.concatenate([[states[0].time], time]), self.dt)
+        if len(full) > len(time):
+            following = np.searchsorted(kept, np.arange(len(full)))
+            knots = [states[0].drive, *_held(readings[:, 0], states[0].drive)]
+            table = np.full((len(full), READINGS), np.nan)
+            table[:, 0] = np.interp(full, [states[0].time, *time], knots)
+            table[kept] = readings
+            return self.run(states, full, table, used[:, following], levels=levels).at(kept)
         count, length = len(states), len(time)
         there = np.isfinite(readings)
         clean = np.where(there, readings, 0.0)
@@ -516,6 +592,21 @@ class JointFilter:
 
 READINGS_OF_MOTION: Final = ("motor position", "motor velocity", "link position", "link velocity")
 """Mechanical state of an elastic joint."""
+
+
+def _bridged(stamps: FloatArray, dt: float) -> tuple[FloatArray, npt.NDArray[np.intp]]:
+    """Stamps after the first one with those of lost samples between them, and where the given ones
+    are in them.
+    """
+    steps = np.diff(stamps)
+    # a step of one and a half is uneven, and nothing is lost
+    lost = np.where(steps <= BRIDGED, np.ceil(steps / dt - 1.5 - 1e-6), 0)
+    lost = np.maximum(lost, 0).astype(np.intp)
+    kept = np.arange(len(steps)) + np.cumsum(lost)
+    if not lost.any():
+        return stamps[1:], kept
+    places = np.concatenate([[-1], kept])
+    return np.interp(np.arange(kept[-1] + 1), places, stamps), kept
 
 
 def _held(drive: FloatArray, before: float) -> FloatArray:

@@ -19,7 +19,7 @@ BALANCES: Final = 3
 """Disturbance torques: motor, transmission, link."""
 READINGS: Final = 6
 """Drive, motor position and velocity, link position and velocity, torque."""
-LEVELS: Final = 18
+LEVELS: Final = 20
 """Numbers of :meth:`identification.online.filter.Levels.vector`."""
 
 CREEP: Final = 0.1
@@ -108,7 +108,15 @@ def predict_function(
     following = a.x + h * ca.mtimes(inverse, rates)
     spread = ca.vertcat(read * spread[0] + (1 - read) * unknown, spread[1:])
     lasting = ca.vertcat(read * lasting[0] + (1 - read) * unknown_lasting, lasting[1:])
-    fade = ca.exp(-h / lasting)
+    motor, link = a.x[1], a.x[3] if len(functions.state_names) > 2 else a.x[1]
+    slow = [ca.exp(-((speed / a.slow[i]) ** 2)) for i, speed in enumerate((motor, link))]
+    # one state stands for the torque that the model lacks, for what the law of a creeping side is
+    # wrong by, and for the friction that holds a side that stands, which pulls nowhere: it fades by
+    # the share of the first
+    wrong = ca.vertcat(a.levels[15] ** 2 * slow[0], 0, a.levels[16] ** 2 * slow[1])
+    holding = ca.vertcat(a.levels[17] ** 2 * slow[0], 0, a.levels[18] ** 2 * slow[1])
+    fresh = spread**2 * (1 - ca.exp(-2 * h / lasting)) + wrong * (1 - ca.exp(-2 * h / CREEP))
+    fade = ca.exp(-h / lasting * spread**2 / (spread**2 + wrong + holding))
     count = len(free)
     kicked = h * ca.mtimes(inverse, pushed)
     transition = ca.vertcat(
@@ -116,16 +124,11 @@ def predict_function(
         ca.horzcat(ca.SX(BALANCES, a.states), ca.diag(fade), ca.SX(BALANCES, count)),
         ca.horzcat(ca.SX(count, a.states + BALANCES), ca.SX.eye(count)),
     )
-    motor, link = a.x[1], a.x[3] if len(functions.state_names) > 2 else a.x[1]
-    slow = [ca.exp(-((speed / a.slow[i]) ** 2)) for i, speed in enumerate((motor, link))]
-    # at a turn dry friction is unsure anew in each sample: white over one sample ...
+    # at a turn dry friction is unsure anew in each sample: white over one sample
     turning = [a.dry[i] ** 2 * sample * slow[i] for i in range(2)]
     white = ca.vertcat(noise**2 + turning[0], 0, turning[1]) / h
-    # ... and what its law is wrong by lasts while the side creeps
-    wrong = [a.levels[15 + i] ** 2 * slow[i] for i in range(2)]
-    creeping = (1 - ca.exp(-2 * h / CREEP)) * ca.vertcat(wrong[0], 0, wrong[1])
     new = ca.mtimes(ca.mtimes(kicked, ca.diag(white)), kicked.T)
-    tail = ca.vertcat(spread**2 * (1 - fade**2) + creeping, a.walks**2 * h)
+    tail = ca.vertcat(fresh, a.walks**2 * h)
     covariance = ca.mtimes(transition, ca.mtimes(a.covariance, transition.T)) + ca.diagcat(
         new, ca.diag(tail)
     )
@@ -140,21 +143,28 @@ def predict_function(
 
 
 def update_function(
-    functions: JointFunctions, model: JointModel, free: Sequence[str], forms: Sequence[Form]
+    functions: JointFunctions,
+    model: JointModel,
+    free: Sequence[str],
+    forms: Sequence[Form],
+    estimated: int,
 ) -> Any:
     """(mean, P, readings, used, p) -> mean, P, outputs of the sample.
 
     readings: drive, motor position and velocity, link position and velocity, torque; used: a flag
     for each, time, temperature. The five are taken one after the other, in Joseph's form, which
-    stays positive; an innovation beyond the limit weighs less (Huber). Outputs as in
+    stays positive; an innovation beyond the limit weighs less (Huber). Parameters behind the
+    `estimated` ones get no gain: their errors count in what is expected, and are not found
+    (Schmidt). Outputs as in
     :meth:`identification.online.filter.JointFilter.sample_function`.
     """
     a = _Layout(functions, model, free, forms)
     readings, used = ca.SX.sym("y", READINGS), ca.SX.sym("used", READINGS + 2)
-    clip = a.levels[17]
+    clip = a.levels[19]
     _, expected = a.joint(used[0] * readings[0], used[READINGS:])
     rows = ca.jacobian(expected, a.mean)
     mean, covariance = a.mean, a.covariance
+    learns = ca.vertcat(*[1] * (a.states + BALANCES + estimated), *[0] * (len(free) - estimated))
     whitened, spread = [], []
     for i in range(READINGS - 1):
         row, on = rows[i, :], used[i + 1]
@@ -165,7 +175,7 @@ def update_function(
         whitened.append(on * error / deviation)
         spread.append(on * deviation + (1 - on))
         wide = total * ca.fmax(1, ca.fabs(error) / (clip * deviation))
-        gain = on * seen / wide
+        gain = learns * on * seen / wide
         mean = mean + gain * error
         half = covariance - ca.mtimes(gain, seen.T)
         back = ca.mtimes(half, row.T)

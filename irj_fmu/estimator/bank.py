@@ -19,13 +19,22 @@ from identification.online.verdict import CURRENT_OR_FRICTION, HELD, MISSING, PL
 from irj_fmu.estimator.healthy import online_readings
 
 if TYPE_CHECKING:
+    from casadi_models import JointModel
     from identification.faults.bank import BankTrack, FaultBank
     from identification.faults.detector import Fault
+    from identification.online.filter import Doubts
 
 FloatArray = npt.NDArray[np.float64]
 
 DERIVED: Final = {2: 1, 4: 3}
 """Velocities and the positions that they are derived from where they are not measured."""
+
+
+FOLLOWS: Final = {
+    "link_position": ("link_position", "link_velocity"),
+    "link_torque": ("torque",),
+}
+"""Readings that have the clock of a channel: a velocity is made by the encoder of its position."""
 
 
 def measured_sensors(record: Record) -> tuple[bool, ...]:
@@ -74,9 +83,45 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
             )
         table = np.array(online_readings(other, joint)[0])
         pieces += [Piece(other.time[part], table[part]) for part in other.segments()]
-    bank = FaultBank(model, record.dt, there)
+    bank = FaultBank(
+        model, record.dt, there, doubts=doubts_of(joint, model), late=lateness(joint, healthy)
+    )
     bank.calibrate(pieces)
     return bank
+
+
+def doubts_of(joint: Joint, model: JointModel) -> Doubts:
+    """What the fit of a joint file leaves open: errors of its values, as they go together.
+
+    A shape bends the readings, which no error of first order follows; what is known has none.
+    """
+    from identification.online.filter import Doubts
+
+    own = {p.name for p in model.parameters if not p.is_shape} - set(joint.known)
+    names = tuple(n for n in model.parameter_names if n in own and joint.errors.get(n, 0.0) > 0.0)
+    errors = np.array([joint.errors[n] for n in names])
+    return Doubts(names, joint.correlation.matrix(names) * np.outer(errors, errors))
+
+
+def lateness(joint: Joint, healthy: Sequence[Record]) -> tuple[float, ...]:
+    """Time by which each reading is late [s], by a fit of nothing but that to healthy records,
+    their mean: a clock belongs to the rig and not to the run. The drive stays as it is read: a
+    filter weighs its readings before and after.
+    """
+    from identification.balance.clocks import NEAR
+    from identification.faults.core import SENSORS
+    from identification.fitting.fit import fit
+    from identification.fitting.joint_text import calibration_of
+
+    found = fit(joint.held(), healthy)
+    own = [c for c in calibration_of(found.solution, found.data) if c.what == "skew"]
+    out = dict.fromkeys(SENSORS, 0.0)
+    for channel, places in FOLLOWS.items():
+        values = [c.value for c in own if c.sensor == channel and not c.bounded]
+        late = float(np.mean(values)) if values else 0.0
+        if abs(late) > NEAR * min(r.dt for r in healthy):
+            out |= dict.fromkeys(places, late)
+    return tuple(out[n] for n in SENSORS)
 
 
 def judged(

@@ -199,7 +199,7 @@ def online_readings(
                 "sensor that is there"
             )
     if faults:
-        table = inject(table, record.dt, faults)
+        table = inject(table, record.dt, faults, time=record.time)
     for at, (channel, position, _) in measured.items():
         if not record.has(channel):
             table[:, at] = np.gradient(table[:, position], record.time)

@@ -68,6 +68,28 @@ def test_the_sensor_is_named(
     assert "smallest offset of a sensor" in capsys.readouterr().out
 
 
+def test_lost_samples_are_no_fault_and_a_fault_is_named_among_them(
+    folder: Path, tmp_path: Path
+) -> None:
+    """A fifth of the samples lost from both files: limits are those of readings as they come, and
+    a fault begins at its time."""
+    rng = np.random.default_rng(17)
+    for name in ("healthy", "unseen"):
+        with np.load(folder / f"{name}.npz") as whole:
+            kept = rng.random(len(whole["time_s"])) > 0.2
+            kept[[0, -1]] = True
+            np.savez(tmp_path / f"{name}.npz", **{n: whole[n][kept] for n in whole.files})
+    out = tmp_path / "out.json"
+    given = ["track", str(tmp_path / "unseen.npz"), "--joint", str(folder / "joint.toml")]
+    given += ["--healthy", str(tmp_path / "healthy.npz"), "--json", str(out)]
+    assert main(given) == 0
+    assert json.loads(out.read_text())["records"][0]["events"] == []
+    assert main([*given, "--inject", "link_position:bias:10:0.01"]) == 0
+    events = json.loads(out.read_text())["records"][0]["events"]
+    assert [e["fault"] for e in events] == [4]
+    assert 9.99 <= events[0]["first"] < 10.1
+
+
 def test_without_healthy_records_no_derived_velocity_is_judged(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -64,7 +64,8 @@ def run_track(arguments: Namespace) -> int:
             raise named(error, path, record) from None
     healthy, more = open_records(arguments.healthy, joint)
     healthy = [r.renamed(path) for r, path in zip(healthy, arguments.healthy, strict=True)]
-    banks = _banks(joint, raw, healthy)
+    as_read = _as_read(arguments.healthy, joint)
+    banks = _banks(joint, raw, as_read)
     plain = [r for r, bank in zip(records, banks, strict=True) if bank is None]
     state = limits(joint, plain[0], healthy) if plain else None
     found = []
@@ -73,7 +74,7 @@ def run_track(arguments: Namespace) -> int:
             if bank is None:
                 found.append(replay(record, joint, state, tried))
             else:
-                watch = (bank, doubtful, _announced(path, bank, healthy[0], joint))
+                watch = (bank, doubtful, _announced(path, bank, as_read[0], joint))
                 found.append(replay(record, joint, None, tried, watch))
         except InputError as error:
             raise named(error, path, record) from None
@@ -132,6 +133,15 @@ def _run_follow(arguments: Namespace, joint: Joint) -> int:
     if broken is not None:
         raise broken
     return 1 if arguments.fail_on_fault and result["events"] else 0
+
+
+def _as_read(paths: Sequence[str], joint: Joint) -> list[Record]:
+    """Healthy records with their holes and stamps: a bank judges readings as they come, and its
+    limits must be of such readings.
+    """
+    from identification.data.read import read
+
+    return [read(path, columns=joint.columns, kind=joint.kind).renamed(path) for path in paths]
 
 
 def _banks(
