@@ -5,8 +5,9 @@ them.
 record of a joint with nothing hidden, takes the limits of the fault bank from the same record, and
 judges the second one: as it is, and with faults (``--faults`` of them for each joint, one at a
 time). It prints what was said about healthy records, the share of faults that were seen, and the
-share in which the failed sensor was named and nothing else. ``--keep FOLDER`` keeps the files and
-the fits.
+share in which the failed sensor was named and nothing else. The bank judges every joint here; `irj
+track` leaves those whose velocities are measured to the detector, which takes milliseconds and not
+a second. ``--keep FOLDER`` keeps the files and the fits.
 """
 
 from __future__ import annotations
