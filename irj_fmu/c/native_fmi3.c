@@ -20,22 +20,12 @@
 #include "native_fmi3_config.h"
 #include "native_shared.c"
 
+#include "fmi3_log.c"
+
 typedef struct { /* an estimator and its host */
     Twin twin;
-    fmi3InstanceEnvironment environment;
-    fmi3LogMessageCallback log;
+    Sink sink;
 } Held;
-
-static void relay(fmi2ComponentEnvironment held, fmi2String name, fmi2Status status, fmi2String category, fmi2String message, ...) {
-    const Held *h = held;
-    char text[768];
-    va_list values;
-    (void)name;
-    va_start(values, message);
-    vsnprintf(text, sizeof text, message, values);
-    va_end(values);
-    if (h->log) h->log(h->environment, status == fmi2Warning ? fmi3Warning : fmi3Error, category, text);
-}
 
 static fmi3Status fail(Twin *m, const char *format, ...) {
     va_list values;
@@ -59,10 +49,9 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
                                          fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
     Held *h = calloc(1, sizeof *h);
     if (!h) return NULL;
-    h->environment = environment;
-    h->log = log;
+    h->sink = (Sink){environment, log};
     h->twin.host.logger = relay;
-    h->twin.host.componentEnvironment = h;
+    h->twin.host.componentEnvironment = &h->sink;
     h->twin.name = "estimator";
     h->twin.logging = logging;
     if (events || !token || strcmp(token, NATIVE_GUID) != 0) {

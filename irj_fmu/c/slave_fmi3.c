@@ -9,26 +9,15 @@
 
 #include "fmi3Functions.h"
 
+#include "fmi3_log.c"
+
 typedef struct { /* what fmi2Instantiate takes for its host */
-    fmi3InstanceEnvironment environment;
-    fmi3LogMessageCallback log;
+    Sink sink;
     fmi2CallbackFunctions functions;
     double now;
 } Host;
 
 static Host *host_of(void *c) { return ((Shim *)c)->host.componentEnvironment; }
-
-/* the shim doubles '%' for hosts that take a text as a format */
-static void relay(fmi2ComponentEnvironment environment, fmi2String name, fmi2Status status, fmi2String category, fmi2String message, ...) {
-    const Host *host = environment;
-    char text[2048];
-    va_list values;
-    (void)name;
-    va_start(values, message);
-    vsnprintf(text, sizeof text, message, values);
-    va_end(values);
-    if (host->log) host->log(host->environment, (fmi3Status)status, category, text);
-}
 
 #define PASSES_ON
 #define COSIMULATION_ONLY
@@ -45,8 +34,7 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     void *made = NULL;
     while (length > 1 && folder[length - 1] == '/') folder[--length] = 0; /* Python knows the folder by its name alone */
     if (host && folder) {
-        host->environment = environment;
-        host->log = log;
+        host->sink = (Sink){environment, log};
         host->functions.logger = relay;
         host->functions.allocateMemory = calloc;
         host->functions.freeMemory = free;

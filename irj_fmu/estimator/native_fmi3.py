@@ -36,7 +36,7 @@ from irj_fmu.fmi.variables import Variable
 
 _C: Final = Path(__file__).parents[1] / "c"
 _MAIN: Final = "native_fmi3.c"
-_OWN: Final = (_MAIN, "fmi3_common.c")
+_OWN: Final = (_MAIN, "fmi3_common.c", "fmi3_log.c")
 _TYPES: Final = {"real": "Float64", "integer": "Int32", "boolean": "Boolean", "string": "String"}
 _ELEMENT: Final = re.compile(r"(.*)\[(\d+)\]")
 CHANNELS: Final = {

@@ -33,6 +33,7 @@ _MINIMUM = ("slave_base.py", "variables.py", "unit_definitions.py", "model_descr
 _ALONE = ("identification.errors", "identification.version", "casadi_models.quantities")
 """Modules of other packages that those need; each imports nothing of the project."""
 _SHIM_TARGET = "x86_64-linux-gnu"
+_SHIM_PARTS = ("slave_shim.c", "living.c", "fmi3_common.c", "fmi3_log.c")
 _NO_SHIM = (
     "built with pythonfmu's own library: runs in Python hosts; C hosts need libpython preloaded "
     "and a path without "
@@ -395,8 +396,7 @@ def _compile_shim(
         "VR_TIME": f"{time_reference(root)}u",
     }
     config = "".join(f"#define {name} {text}\n" for name, text in defined.items())
-    sources = {
-        name: (_HERE.parent / "c" / name).read_bytes()
-        for name in dict.fromkeys((main, "slave_shim.c", "living.c", "fmi3_common.c"))
-    } | {"shim_config.h": config.encode()}
+    sources = {name: (_HERE.parent / "c" / name).read_bytes() for name in (main, *_SHIM_PARTS)} | {
+        "shim_config.h": config.encode()
+    }
     return compile_library(sources, main, _SHIM_TARGET, cc=cc, libraries=("dl", "pthread"))
