@@ -22,6 +22,8 @@ READINGS: Final = 6
 LEVELS: Final = 20
 """Numbers of :meth:`identification.online.filter.Levels.vector`."""
 
+LEAST: Final = 1e-300
+"""Square of a torque that is none: a model may be said to lack nothing."""
 CREEP: Final = 0.1
 """Time for which a side stays at one part of the friction law while it turns [s]: what the law is
 wrong by there lasts as long, and no record tells the law at such speeds well."""
@@ -116,7 +118,8 @@ def predict_function(
     wrong = ca.vertcat(a.levels[15] ** 2 * slow[0], 0, a.levels[16] ** 2 * slow[1])
     holding = ca.vertcat(a.levels[17] ** 2 * slow[0], 0, a.levels[18] ** 2 * slow[1])
     fresh = spread**2 * (1 - ca.exp(-2 * h / lasting)) + wrong * (1 - ca.exp(-2 * h / CREEP))
-    fade = ca.exp(-h / lasting * spread**2 / (spread**2 + wrong + holding))
+    total = ca.fmax(spread**2 + wrong + holding, LEAST)  # none of them: nothing is there to fade
+    fade = ca.exp(-h / lasting * spread**2 / total)
     count = len(free)
     kicked = h * ca.mtimes(inverse, pushed)
     transition = ca.vertcat(
