@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, final
 
 import numpy as np
@@ -182,7 +183,7 @@ class FaultBank:
         size = max(round(CHUNK / self.dt), 1)
         cut = [
             Piece(p.time[k : k + size], p.rows[k : k + size])
-            for p in map(self.in_time, without_gaps(healthy))
+            for p in map(self.in_time, self.usable(healthy))
             for k in range(0, len(p.time), size)
         ]
         long = [p for p in cut if p.time[-1] - p.time[0] > 2 * SETTLE]
@@ -237,6 +238,18 @@ class FaultBank:
             work.scores,
         )
 
+    def usable(self, pieces: Sequence[Piece]) -> list[Piece]:
+        """Healthy stretches between the gaps, which start the filters anew. A sample of which a
+        reading is missing or absurd counts as lost: limits are of whole samples.
+        """
+        own, out = list(self.sensors), []
+        for p in pieces:
+            whole = (np.abs(np.nan_to_num(p.rows[:, own], nan=np.inf)) < ABSURD).all(axis=1)
+            time, rows = p.time[whole], p.rows[whole]
+            edges = [0, *(np.flatnonzero(np.diff(time) > GAP) + 1).tolist(), len(time)]
+            out += [Piece(time[a:b], rows[a:b]) for a, b in pairwise(edges) if b > a]
+        return out
+
     def in_time(self, piece: Piece) -> Piece:
         """A stretch without gaps, its late readings at their own time."""
         rows, part = aligned(piece.time, piece.rows, self.late), inside(piece.time, self.late)
@@ -248,7 +261,7 @@ class FaultBank:
 
         Bisected on a healthy record, at some times of its motion, and times :data:`ANNOUNCED`.
         """
-        piece = self.in_time(max(without_gaps([healthy]), key=lambda p: len(p.time)))
+        piece = self.in_time(max(self.usable([healthy]), key=lambda p: len(p.time)))
         time, rows = piece.time, piece.rows
         places = [
             int(np.searchsorted(time, time[0] + share * (time[-1] - time[0])))
@@ -351,15 +364,6 @@ class FaultBank:
             levels=tuning.levels,
             limits=tuning.limits[0],
         )
-
-
-def without_gaps(pieces: Sequence[Piece]) -> list[Piece]:
-    """Stretches between the gaps, which start the filters anew."""
-    out = []
-    for p in pieces:
-        edges = [0, *(np.flatnonzero(np.diff(p.time) > GAP) + 1).tolist(), len(p.time)]
-        out += [Piece(p.time[a:b], p.rows[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    return out
 
 
 def told(worst: FloatArray) -> int | None:

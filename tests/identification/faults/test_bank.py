@@ -42,6 +42,29 @@ def test_nothing_is_said_about_a_healthy_joint(bank: FaultBank, unseen: Readings
     assert 0.2 < track.scores[2000:].max() < 0.9
 
 
+def test_missing_readings_in_healthy_records_cost_nothing_but_their_samples(
+    bank: FaultBank, unseen: Readings
+) -> None:
+    """Numbers that are none, or absurd, in some samples, and a gap: limits stay what they are."""
+    rng, pieces = np.random.default_rng(8), []
+    for seed in (31, 32):
+        whole = recorded(seed, 20.0)
+        rows, kept = whole.rows.copy(), np.ones(len(whole.time), dtype=bool)
+        for sensor, value in ((0, np.nan), (3, np.nan), (5, np.inf), (1, 1e30)):
+            rows[rng.integers(0, len(rows), 20), sensor] = value
+        kept[9000:9200] = False
+        pieces.append(Piece(whole.time[kept], rows[kept]))
+    made = FaultBank(plant(), DT, THERE)
+    tuning = made.calibrate(pieces)
+    # of the innovations of both positions and the torque; no torque is lacking, and any small level
+    # says so
+    share = (tuning.limits[0, :-3] / bank.tuned.limits[0, :-3]).reshape(-1, 5)[:, [0, 2, 4]]
+    assert 1 / 1.5 < share.min() < share.max() < 1.5
+    assert run(made, unseen).events == ()
+    fault = run(made, unseen, Fault("link_position", "bias", BEGIN, 0.01))
+    assert [e.sensors for e in fault.events] == [("link_position",)]
+
+
 @pytest.mark.parametrize(
     ("sensor", "kind", "size"),
     [
