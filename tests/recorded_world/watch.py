@@ -62,12 +62,13 @@ class Watched:
 
 def watched(seed: int, folder: Path, given: str = "all", faults: int = 2) -> list[Watched] | str:
     """A joint's second record, healthy and with faults; why not, where no bank can watch it."""
+    from benchmarks.fault_files.__main__ import opened
     from irj_fmu.estimator.bank import bank_for, judged
 
     case = make_case(seed, kind="none")
     here = write_case(case, folder / str(seed), given)
     joint = _fitted(here)
-    train, test = (_opened(here / f"{n}.csv", joint) for n in ("train", "test"))
+    train, test = (opened(here / f"{n}.csv", joint) for n in ("train", "test"))
     bank = bank_for(joint, test, [train])
     if bank is None:
         return "no bank: rigid, not fitted, or one encoder"
@@ -99,15 +100,15 @@ def drawn(seed: int, number: int, record: Record, joint: Joint, bank: FaultBank)
 
 def scored(seed: int, fault: Fault, record: Record, events: Sequence[FaultEvent]) -> Watched:
     """Whether a fault was seen, and named with nothing else; what is said before it is wrong."""
+    from benchmarks.fault_files.__main__ import names_sensor
     from identification.faults.types import Verdict
 
     since = record.time - record.time[0]
     real = [e for e in events if e.verdict is not Verdict.RECOVERED]
     early = [e for e in real if since[e.sample] < fault.start - record.dt]
     late = [e for e in real if e not in early and since[e.first] <= fault.start + LOOK]
-    sure = (Verdict.SENSOR, Verdict.DROPOUT, Verdict.CURRENT_OR_FRICTION)
     right = bool(late) and not early
-    right = right and all(e.verdict in sure and e.sensors == (fault.sensor,) for e in late)
+    right = right and all(names_sensor(e) and e.sensors == (fault.sensor,) for e in late)
     said = tuple(_words(record, e) for e in [*early, *late])
     return Watched(seed, fault, said, bool(late), right)
 
@@ -125,13 +126,6 @@ def _fitted(folder: Path) -> Joint:
         if code:
             raise SystemExit(f"{folder}: irj fit ended with {code}")
     return load_joint(found)
-
-
-def _opened(path: Path, joint: Joint) -> Record:
-    """A file as `irj track` reads it, holes and all."""
-    from identification.data.read import read
-
-    return read(path, columns=joint.columns, kind=joint.kind)
 
 
 def _words(record: Record, event: FaultEvent) -> str:
