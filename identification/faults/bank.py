@@ -21,7 +21,7 @@ from identification.errors import InputError
 from identification.faults.bank_clocks import aligned, inside
 from identification.faults.bank_levels import SETTLE, Piece, first_levels, likeliest
 from identification.faults.bank_spring import OPENED, STIFFNESS, SpringFilters, opened
-from identification.faults.bank_statistics import WINDOWS, limits, statistics
+from identification.faults.bank_statistics import WINDOWS, by_reading, limits, statistics
 from identification.faults.core import (
     ABSURD,
     CURRENT,
@@ -47,7 +47,8 @@ NEXT: Final = (0.5, 0.6)
 RECOVER: Final = 1.1
 """A failed sensor must agree with the others for this long to be read again [s]."""
 PLANT_REST: Final = 5.0
-"""No second report about the joint itself for this long [s]."""
+"""A joint that changed stays changed: it is told again where the readings agreed with the model for
+this long in between [s]."""
 HEAD: Final = 1.0
 """Seconds at the beginning in which every reading is believed."""
 FIRST: Final = 0.5
@@ -98,12 +99,16 @@ class BankTrack:
         Readings with failed ones replaced by what the others say.
     scores : (n, filters) array
         Largest statistic of each filter over its limit; the first one reads all sensors.
+    residuals : (n, 6) array
+        Largest statistic of each reading in that first filter over its limit (see
+        :func:`identification.faults.bank_statistics.by_reading`); 0 where no filter ran.
     """
 
     events: tuple[FaultEvent, ...]
     failed: BoolArray
     readings: FloatArray
     scores: FloatArray
+    residuals: FloatArray
 
 
 @final
@@ -236,6 +241,7 @@ class FaultBank:
             work.failed,
             np.where(work.failed, work.readings, given),
             work.scores,
+            work.residuals,
         )
 
     def usable(self, pieces: Sequence[Piece]) -> list[Piece]:
@@ -274,7 +280,7 @@ class FaultBank:
             low, high = 0.0, max(4.0 * float(spread[sensor]), 1e-9)
             for _ in range(BISECTIONS):
                 middle = high * 0.03 if low == 0.0 else (low * high) ** 0.5
-                if all(p.scores(sensor, middle)[0] > 1 for p in probes):
+                if all(p.sees(sensor, middle) for p in probes):
                     high = middle
                 else:
                     low = middle
@@ -411,19 +417,22 @@ class _Probe:
             ]
         return not bank.explained(state, time[begin:], rows[begin:])[1]
 
-    def scores(self, sensor: int, offset: float) -> FloatArray:
-        """Largest score of each filter after an offset of a sensor, (filters,)."""
-        bank, rows = self.bank, self.rows.copy()
+    def sees(self, sensor: int, offset: float) -> bool:
+        """Whether an offset of a sensor brings the filter that reads all of them to its limits."""
+        return bool(self.scores(sensor, offset, 1)[0] > 1)
+
+    def scores(self, sensor: int, offset: float, filters: int | None = None) -> FloatArray:
+        """Largest score of each filter, or of the first few, after an offset of a sensor."""
+        bank, rows, states = self.bank, self.rows.copy(), self.states[:filters]
         rows[self.begin :, sensor] += offset
-        course = bank.joint.run(
-            self.states, self.time, rows, bank.flags(len(rows)), levels=bank.tuned.levels
-        )
+        flags, levels = bank.flags(len(rows))[: len(states)], bank.tuned.levels
+        course = bank.joint.run(states, self.time, rows, flags, levels=levels)
         return np.array(
             [
-                (statistics(course, k, bank.joint, bank.tuned.levels) / bank.tuned.limits[k])[
+                (statistics(course, k, bank.joint, levels) / bank.tuned.limits[k])[
                     self.begin :
                 ].max()
-                for k in range(len(self.states))
+                for k in range(len(states))
             ]
         )
 
@@ -438,6 +447,7 @@ class _Work:
         self.events: list[FaultEvent] = []
         self.failed = np.zeros(rows.shape, dtype=np.bool_)
         self.scores = np.zeros((len(time), 1 + len(bank.sensors)))
+        self.residuals = np.zeros(rows.shape)
         self.readings = rows.copy()
         self.quiet = -np.inf
 
@@ -480,8 +490,7 @@ class _Work:
         length = chunk = round(CHUNK / bank.dt)
         while at < last:
             end = min(at + length, last)
-            scores = self._scored(states, slice(at, end))
-            self.scores[at + skip : end] = scores[skip:]
+            scores = self._scored(states, slice(at, end), skip)
             over = (scores[:, 0] > 1) & (self.time[at:end] > armed)
             over[:skip] = False
             alarm = at + int(np.argmax(over)) if over.any() else end
@@ -544,8 +553,8 @@ class _Work:
                     break
         return found
 
-    def _scored(self, states: Sequence[FilterState], part: slice) -> FloatArray:
-        """Scores of all filters over a stretch."""
+    def _scored(self, states: Sequence[FilterState], part: slice, skip: int = 0) -> FloatArray:
+        """Scores of all filters over a stretch; the first so many samples only fill the windows."""
         bank, tuning = self.bank, self.tuning
         time, rows = self.time[part], self.rows[part]
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
@@ -553,6 +562,10 @@ class _Work:
         for k in range(len(states)):
             shares = statistics(course, k, bank.joint, tuning.levels) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
+            if k == 0:
+                own = np.nan_to_num(by_reading(shares), nan=np.inf)
+                self.residuals[part.start + skip : part.stop] = own[skip:]
+        self.scores[part.start + skip : part.stop] = out[skip:]
         return out
 
     def _advanced(
@@ -627,7 +640,6 @@ class _Work:
             end = min(int(np.searchsorted(self.time, self.time[at] + RECOVER)), last)
             part = slice(at, max(end, at + 1))
             scores = self._scored([state] * (1 + len(bank.sensors)), part)
-            self.scores[part] = scores
             there = np.isfinite(self.rows[part, sensor]).all()
             if there and scores[:, 0].max() < 1 and end < last:
                 self.failed[begin:end, sensor] = True
@@ -643,11 +655,11 @@ class _Work:
 
     def _report(self, alarm: int, decided: int, verdict: Verdict, sensors: tuple[str, ...]) -> None:
         about_joint = verdict in (Verdict.PLANT, Verdict.ONE_OF)
-        if about_joint and self.time[decided] < self.quiet:
-            return
+        known = self.time[alarm] < self.quiet
         if about_joint:
             self.quiet = self.time[decided] + PLANT_REST
-        self._say(alarm, decided, verdict, sensors)
+        if not (about_joint and known):
+            self._say(alarm, decided, verdict, sensors)
 
     def _say(self, first: int, sample: int, verdict: Verdict, sensors: tuple[str, ...]) -> None:
         over = np.flatnonzero(self.scores[sample] > 1)

@@ -37,6 +37,9 @@ ALONE: Final = 0.03
 lacks most."""
 GAIN: Final = 2.0
 """Rise of the log-likelihood worth a change: two standard deviations of one parameter."""
+HOPELESS: Final = 300.0
+"""Levels are not tried to the last stretch where they are worse than the best by this much in the
+first ones [log-likelihood]: stretches differ by less in what they say of a level."""
 SHIFTS: Final = (-1.0, 3.0)
 """Bounds of the share of the later drive reading: from half a sample early to three late."""
 VALLEYS: Final = (2.0, -2.0)
@@ -98,20 +101,30 @@ def likeliest(
     few = _few(pieces)
     used = np.array(measured, dtype=np.float64)
 
-    def cost(levels: Levels, flags: FloatArray = used, every: int = 1) -> float:
-        total = 0.0
-        for piece in few[::every]:
-            table = np.broadcast_to(flags, (1, len(piece.time), 6))
-            state = joint.start(
-                float(piece.time[0]), piece.rows[0].tolist(), flags.tolist(), levels=levels
-            )
-            course = joint.run([state], piece.time, piece.rows, table, levels=levels)
-            late = piece.time - piece.time[0] > SETTLE
-            e, s = course.innovation[0, late], course.spread[0, late]
-            if not np.isfinite(e).all():
-                return math.inf
-            total += float(np.sum((DEGREES + 1) / 2 * np.log1p(e**2 / DEGREES) + np.log(s)))
-        return total
+    def one(levels: Levels, piece: Piece, flags: FloatArray) -> float:
+        table = np.broadcast_to(flags, (1, len(piece.time), 6))
+        state = joint.start(
+            float(piece.time[0]), piece.rows[0].tolist(), flags.tolist(), levels=levels
+        )
+        course = joint.run([state], piece.time, piece.rows, table, levels=levels)
+        late = piece.time - piece.time[0] > SETTLE
+        e, s = course.innovation[0, late], course.spread[0, late]
+        if not np.isfinite(e).all():
+            return math.inf
+        return float(np.sum((DEGREES + 1) / 2 * np.log1p(e**2 / DEGREES) + np.log(s)))
+
+    def cost(
+        levels: Levels, flags: FloatArray = used, every: int = 1, best: FloatArray | None = None
+    ) -> FloatArray:
+        """Minus the log-likelihood of each stretch; those after the first few are left at infinity
+        where levels are clearly worse than the best ones.
+        """
+        out = np.full(len(few[::every]), math.inf)
+        for k, piece in enumerate(few[::every]):
+            out[k] = one(levels, piece, flags)
+            if best is not None and not out[: k + 1].sum() < best[: k + 1].sum() + HOPELESS:
+                break
+        return out
 
     moves = _moves(measured)
 
@@ -119,18 +132,20 @@ def likeliest(
         least = cost(best, every=every)
         for factor in factors:
             for _ in range(SWEEPS):
-                before = least
+                before = least.sum()
                 for move in moves:
                     for step in (factor, 1 / factor):
-                        while True:
-                            tried = move(best, step)
-                            found = cost(tried, every=every) if tried != best else math.inf
-                            if not found < least - GAIN:
+                        start = best
+                        while (tried := move(best, step)) != best:
+                            found = cost(tried, every=every, best=least)
+                            if not found.sum() < least.sum() - GAIN:
                                 break
                             best, least = tried, found
-                if before - least < GAIN * len(moves):
+                        if best != start:
+                            break  # the other direction leads back
+                if before - least.sum() < GAIN * len(moves):
                     break
-        return least, best
+        return float(least.sum()), best
 
     dry = (float(joint.dry[0]), float(joint.dry[1]))
     turns = replace(first, creeping=dry, holding=dry)
@@ -145,8 +160,8 @@ def likeliest(
             for step in (factor, 1 / factor):
                 change: dict[str, Any] = {name: getattr(best, name) * step}
                 tried = replace(best, **change)
-                found = cost(tried, without)
-                if found < least - GAIN:
+                found = cost(tried, without, best=least)
+                if found.sum() < least.sum() - GAIN:
                     best, least = tried, found
     return best
 

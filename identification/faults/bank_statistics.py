@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identification.online.filter import Course, JointFilter, Levels
+from identification.online.filter_step import BALANCES
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,6 +65,26 @@ def statistics(course: Course, which: int, joint: JointFilter, levels: Levels) -
     unsure = UNSURE * course.deviation[which] + joint.unsure_friction(course, which, levels)
     known = np.maximum(np.abs(course.disturbance[which]) - unsure, 0.0)
     return np.concatenate([windows, known], axis=1)
+
+
+def by_reading(shares: FloatArray, readings: int = 5) -> FloatArray:
+    """The largest statistic of each reading, all as shares of their limits, (n, 1 + readings).
+
+    Parameters
+    ----------
+    shares : (n, count) array
+        Of :func:`statistics`, of the filter that reads all sensors.
+    readings : int
+
+    Returns
+    -------
+    array
+        In the order of :data:`identification.faults.core.SENSORS`; the drive's is that of the
+        torque which the motor's balance lacks.
+    """
+    rows = len(shares)
+    own = shares[:, :-BALANCES].reshape(rows, -1, readings).max(axis=1)
+    return np.column_stack([shares[:, -BALANCES], own])
 
 
 def over_windows(innovations: FloatArray, dt: float) -> FloatArray:

@@ -4,8 +4,8 @@ on a file.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from casadi_models import JointModel
     from identification.faults.bank import BankTrack, FaultBank
     from identification.faults.detector import Fault
+    from identification.faults.types import FaultEvent
     from identification.online.filter import Doubts
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,10 +53,11 @@ def measured_sensors(record: Record) -> tuple[bool, ...]:
 
 
 def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBank | None:
-    """A bank for a record's sensors with levels and limits from healthy records.
+    """A bank for a record's sensors with levels and limits from healthy records. A velocity that
+    one of these lacks is not judged.
 
-    None where a bank cannot work: a rigid joint, one without fitted values, one encoder only, no
-    healthy records.
+    None where a bank cannot work: a rigid joint, one without fitted values, one encoder only,
+    several runs in the record, no healthy records.
 
     Raises
     ------
@@ -69,7 +71,12 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
         has_link=record.has("link_position"), has_torque=record.has("link_torque")
     )
     there = measured_sensors(record)
+    for other in healthy:
+        both = zip(there, measured_sensors(other), strict=True)
+        there = tuple(a and (b or i not in DERIVED) for i, (a, b) in enumerate(both))
     if not (healthy and joint.fitted and there[1] and there[3]):
+        return None
+    if not (np.diff(record.time) >= 0).all():
         return None
     model, _ = prepared(joint, options)
     if not model.is_elastic:
@@ -124,6 +131,39 @@ def lateness(joint: Joint, healthy: Sequence[Record]) -> tuple[float, ...]:
     return tuple(out[n] for n in SENSORS)
 
 
+@final
+@dataclass(frozen=True)
+class Watching:
+    """A fault bank and what it looks at.
+
+    Attributes
+    ----------
+    bank : FaultBank
+    record : Record
+        As read, missing readings and uneven stamps as they are.
+    smallest : mapping of str to pair of float
+        Smallest offset of each sensor that is seen, and that is named; empty where it was not asked
+        for.
+    """
+
+    bank: FaultBank
+    record: Record
+    smallest: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def smallest_offsets(
+    bank: FaultBank, healthy: Record, joint: Joint
+) -> dict[str, tuple[float, float]]:
+    """Smallest offset of each sensor that a bank sees, and that it names, on the longest stretch of
+    a healthy record (see :meth:`identification.faults.bank.FaultBank.smallest`).
+    """
+    from identification.faults.bank_levels import Piece
+
+    longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
+    rows = np.array(online_readings(healthy, joint)[0])[longest]
+    return bank.smallest(Piece(healthy.time[longest], rows))
+
+
 def judged(
     bank: FaultBank, record: Record, joint: Joint, faults: Sequence[Fault] = ()
 ) -> BankTrack:
@@ -139,28 +179,32 @@ class Judgement:
     Attributes
     ----------
     events : tuple of dict
-        ``time`` [s], ``fault`` (code as the estimator's), ``text``.
+        ``time`` [s], ``first`` [s], ``fault`` (code as the estimator's), ``sensors``, ``verdict``.
+    verdicts : tuple of (time [s], FaultEvent)
+        All that the bank said, also that a sensor agrees again.
     failed : (n, 6) bool array
         Where a reading is not to be used.
     readings : (n, 6) array
         Readings with failed ones replaced.
+    scores : (n, 6) array
+        Largest statistic of each reading over its limit; 0 where a velocity is derived.
     """
 
     events: tuple[dict[str, Any], ...]
+    verdicts: tuple[tuple[float, FaultEvent], ...]
     failed: npt.NDArray[np.bool_]
     readings: FloatArray
+    scores: FloatArray
 
 
 def judgement(
-    bank: FaultBank, record: Record, even: Record, joint: Joint, faults: Sequence[Fault] = ()
+    watching: Watching, even: Record, joint: Joint, faults: Sequence[Fault] = ()
 ) -> Judgement:
     """What a bank says about a record, brought to the samples of its even form.
 
     Parameters
     ----------
-    bank : FaultBank
-    record : Record
-        As read, missing readings and uneven stamps as they are.
+    watching : Watching
     even : Record
         What the estimator replays.
     joint : Joint
@@ -170,6 +214,7 @@ def judgement(
     from identification.faults.core import SENSORS
     from identification.faults.types import Verdict
 
+    bank, record = watching.bank, watching.record
     track = judged(bank, record, joint, faults)
     at = np.clip(np.searchsorted(record.time, even.time + 1e-9) - 1, 0, len(record) - 1)
     failed, readings = track.failed[at], track.readings[at]
@@ -198,4 +243,5 @@ def judgement(
                     "verdict": event.verdict,
                 }
             )
-    return Judgement(tuple(events), failed, readings)
+    verdicts = tuple((float(record.time[e.sample]), e) for e in track.events)
+    return Judgement(tuple(events), verdicts, failed, readings, track.residuals[at])

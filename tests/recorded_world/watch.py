@@ -5,9 +5,10 @@ them.
 record of a joint with nothing hidden, takes the limits of the fault bank from the same record, and
 judges the second one: as it is, and with faults (``--faults`` of them for each joint, one at a
 time). It prints what was said about healthy records, the share of faults that were seen, and the
-share in which the failed sensor was named and nothing else. The bank judges every joint here; `irj
-track` leaves those whose velocities are measured to the detector, which takes milliseconds and not
-a second. ``--keep FOLDER`` keeps the files and the fits.
+share in which the failed sensor was named and nothing else. ``--rule detector`` asks the detector
+of the estimator FMUs, which takes milliseconds and not a second, about the joints whose velocities
+are measured; ``--velocities`` leaves out the others. ``--keep FOLDER`` keeps the files and the
+fits.
 """
 
 from __future__ import annotations
@@ -29,13 +30,11 @@ from tests.recorded_world.sensors import SETS
 from tests.recorded_world.world import make_case, stream, write_case
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from identification.data.joint_file import Joint
     from identification.data.record import Record
-    from identification.faults.bank import FaultBank
     from identification.faults.detector import Fault
-    from identification.faults.types import FaultEvent
 
 KINDS: Final = ("bias", "drift", "gain", "noise", "spike", "stuck", "dropout")
 TORQUES: Final = ("current", "torque")
@@ -60,35 +59,90 @@ class Watched:
     right: bool = False
 
 
-def watched(seed: int, folder: Path, given: str = "all", faults: int = 2) -> list[Watched] | str:
-    """A joint's second record, healthy and with faults; why not, where no bank can watch it."""
+Said = tuple[float, float, tuple[str, ...], bool]
+"""When something was said and when it began [s], about which sensors, whether it names one."""
+
+
+def watched(
+    seed: int, folder: Path, given: str = "all", faults: int = 2, rule: str = "bank"
+) -> list[Watched] | str:
+    """A joint's second record, healthy and with faults; why not, where nothing can watch it."""
     from benchmarks.fault_files.__main__ import opened
-    from irj_fmu.estimator.bank import bank_for, judged
 
     case = make_case(seed, kind="none")
     here = write_case(case, folder / str(seed), given)
     joint = _fitted(here)
     train, test = (opened(here / f"{n}.csv", joint) for n in ("train", "test"))
-    bank = bank_for(joint, test, [train])
-    if bank is None:
-        return "no bank: rigid, not fitted, or one encoder"
-    events = judged(bank, test, joint).events
-    out = [Watched(seed, None, tuple(_words(test, e) for e in events))]
+    judge = (_bank if rule == "bank" else _detector)(joint, train, test)
+    if judge is None:
+        return "nothing can watch it: rigid, not fitted, or a sensor is missing"
+    out = [Watched(seed, None, tuple(map(_words, judge([]))))]
     for number in range(faults):
-        fault = drawn(seed, number, test, joint, bank)
-        events = judged(bank, test, joint, [fault]).events
-        out.append(scored(seed, fault, test, events))
+        fault = drawn(seed, number, test, joint)
+        out.append(scored(seed, fault, test, judge([fault])))
     return out
 
 
-def drawn(seed: int, number: int, record: Record, joint: Joint, bank: FaultBank) -> Fault:
+def _bank(
+    joint: Joint, train: Record, test: Record
+) -> Callable[[Sequence[Fault]], list[Said]] | None:
+    """What the fault bank says."""
+    from benchmarks.fault_files.__main__ import names_sensor
+    from identification.faults.types import Verdict
+    from irj_fmu.estimator.bank import bank_for, judged
+
+    bank = bank_for(joint, test, [train])
+    if bank is None:
+        return None
+
+    def judge(faults: Sequence[Fault]) -> list[Said]:
+        track, since = judged(bank, test, joint, faults), test.time - test.time[0]
+        return [
+            (float(since[e.sample]), float(since[e.first]), e.sensors, names_sensor(e))
+            for e in track.events
+            if e.verdict is not Verdict.RECOVERED
+        ]
+
+    return judge
+
+
+def _detector(
+    joint: Joint, train: Record, test: Record
+) -> Callable[[Sequence[Fault]], list[Said]] | None:
+    """What the detector of the estimator says."""
+    from identification.data.check.checks import repair
+    from identification.faults.core import SENSORS
+    from identification.online.verdict import CURRENT_OR_FRICTION, MISSING
+    from workbench.cli.online import limits, replay
+
+    if not test.has("motor_velocity", "link_velocity", "link_torque"):
+        return None
+    healthy, whole = repair(train), repair(test)
+    state = limits(joint, whole, [healthy])
+
+    def judge(faults: Sequence[Fault]) -> list[Said]:
+        out: list[Said] = []
+        for event in replay(whole, joint, state, faults, progress=lambda *_: None).events:
+            code, when = event["fault"], float(event["time"] - test.time[0])
+            at = code % MISSING if code < 2 * MISSING else 0
+            at = 1 if code == CURRENT_OR_FRICTION else at
+            one = 1 <= at <= len(SENSORS)
+            out.append((when, when, (SENSORS[at - 1],) if one else (event["text"],), one))
+        return out
+
+    return judge
+
+
+def drawn(seed: int, number: int, record: Record, joint: Joint) -> Fault:
     """The fault of a number: sensors and kinds take turns over the seeds."""
     from identification.faults.core import SENSORS
     from identification.faults.detector import Fault
+    from irj_fmu.estimator.bank import measured_sensors
     from irj_fmu.estimator.healthy import online_readings
 
     rng = stream(seed, "fault", number)
-    sensor = bank.sensors[(seed + number) % len(bank.sensors)]
+    there = np.flatnonzero(measured_sensors(record)).tolist()
+    sensor = there[(seed + number) % len(there)]
     kind = KINDS[(seed + 3 * number) % len(KINDS)]
     spread = float(np.nanstd(np.array(online_readings(record, joint)[0])[:, sensor]))
     name = SENSORS[sensor]
@@ -98,19 +152,13 @@ def drawn(seed: int, number: int, record: Record, joint: Joint, bank: FaultBank)
     return Fault(name, kind, float(rng.uniform(EARLIEST, LATEST)), sign * size)  # type: ignore[arg-type]
 
 
-def scored(seed: int, fault: Fault, record: Record, events: Sequence[FaultEvent]) -> Watched:
+def scored(seed: int, fault: Fault, record: Record, said: Sequence[Said]) -> Watched:
     """Whether a fault was seen, and named with nothing else; what is said before it is wrong."""
-    from benchmarks.fault_files.__main__ import names_sensor
-    from identification.faults.types import Verdict
-
-    since = record.time - record.time[0]
-    real = [e for e in events if e.verdict is not Verdict.RECOVERED]
-    early = [e for e in real if since[e.sample] < fault.start - record.dt]
-    late = [e for e in real if e not in early and since[e.first] <= fault.start + LOOK]
+    early = [e for e in said if e[0] < fault.start - record.dt]
+    late = [e for e in said if e not in early and e[1] <= fault.start + LOOK]
     right = bool(late) and not early
-    right = right and all(names_sensor(e) and e.sensors == (fault.sensor,) for e in late)
-    said = tuple(_words(record, e) for e in [*early, *late])
-    return Watched(seed, fault, said, bool(late), right)
+    right = right and all(one and sensors == (fault.sensor,) for _, _, sensors, one in late)
+    return Watched(seed, fault, tuple(map(_words, [*early, *late])), bool(late), right)
 
 
 def _fitted(folder: Path) -> Joint:
@@ -128,10 +176,9 @@ def _fitted(folder: Path) -> Joint:
     return load_joint(found)
 
 
-def _words(record: Record, event: FaultEvent) -> str:
-    names = " or ".join(event.sensors)
-    when = record.time[event.sample] - record.time[0]
-    return f"{when:.2f} s {event.verdict.name} {names}".strip()
+def _words(said: Said) -> str:
+    when, _, sensors, _ = said
+    return f"{when:.2f} s {' or '.join(sensors) or 'the joint changed'}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -144,13 +191,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--faults", type=int, default=2, help="faults for each joint")
     parser.add_argument("--sensors", choices=SETS, default="all")
+    parser.add_argument("--rule", choices=("bank", "detector"), default="bank")
+    parser.add_argument("--velocities", action="store_true", help="joints that measure them")
     parser.add_argument("--keep", type=Path, help="folder of the files and fits")
     options = parser.parse_args(argv)
     found: list[Watched] = []
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as top:
         for seed in range(options.start, options.start + options.joints):
-            own = watched(seed, options.keep or Path(top), options.sensors, options.faults)
+            if options.velocities and not make_case(seed, kind="none").sensors.velocities:
+                continue
+            folder = options.keep or Path(top)
+            own = watched(seed, folder, options.sensors, options.faults, options.rule)
             if isinstance(own, str):
                 sys.stdout.write(f"{seed}: {own}\n")
                 continue

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from identification.data.formats import words
 from identification.errors import InputError
 from irj_fmu.command_line import counted
+from irj_fmu.estimator.bank import Watching, bank_for, judgement, measured_sensors, smallest_offsets
 from irj_fmu.estimator.healthy import may_watch, online_readings
 from workbench.cli.files import (
     named,
@@ -74,7 +75,7 @@ def run_track(arguments: Namespace) -> int:
             if bank is None:
                 found.append(replay(record, joint, state, tried))
             else:
-                watch = (bank, doubtful, _announced(path, bank, as_read[0], joint))
+                watch = Watching(bank, doubtful, _announced(path, bank, as_read[0], joint))
                 found.append(replay(record, joint, None, tried, watch))
         except InputError as error:
             raise named(error, path, record) from None
@@ -147,21 +148,15 @@ def _as_read(paths: Sequence[str], joint: Joint) -> list[Record]:
 def _banks(
     joint: Joint, records: Sequence[Record], healthy: Sequence[Record]
 ) -> list[FaultBank | None]:
-    """A fault bank for each record where a velocity is derived; None where both are measured, the
-    record has several runs, or no bank can be made. Records with the same sensors and step share
-    one.
+    """A fault bank for each record; None where none can be made (see
+    :func:`irj_fmu.estimator.bank.bank_for`). Records with the same sensors and step share one.
     """
-    from irj_fmu.estimator.bank import bank_for, measured_sensors
-
     made: dict[tuple[object, ...], FaultBank | None] = {}
     out: list[FaultBank | None] = []
     for record in records:
-        measured = record.has("motor_velocity", "link_velocity")
-        if measured or not healthy or not (np.diff(record.time) >= 0).all():
-            out.append(None)
-            continue
         limits_fit(record, healthy)
-        key = (*measured_sensors(record), float(f"{record.dt:.3g}"))
+        one_run = bool((np.diff(record.time) >= 0).all())
+        key = (one_run, *measured_sensors(record), float(f"{record.dt:.3g}"))
         if key not in made:
             made[key] = bank_for(joint, record, healthy)
         out.append(made[key])
@@ -172,12 +167,9 @@ def _announced(
     path: str, bank: FaultBank, healthy: Record, joint: Joint
 ) -> dict[str, tuple[float, float]]:
     """Print, and give, the smallest offsets that a bank sees on this joint."""
-    from identification.faults.bank_levels import Piece
     from identification.faults.detector import SENSORS
 
-    longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
-    rows = np.array(online_readings(healthy, joint)[0])[longest]
-    found = bank.smallest(Piece(healthy.time[longest], rows))
+    found = smallest_offsets(bank, healthy, joint)
     print(
         f"{path}: smallest offset of a sensor that is seen, and that is named (referred to the "
         "link)"
@@ -323,7 +315,7 @@ def replay(
     joint: Joint,
     detector_state: bytes | None = None,
     tried: Sequence[Fault] = (),
-    watch: tuple[FaultBank, Record, dict[str, tuple[float, float]]] | None = None,
+    watch: Watching | None = None,
     *,
     progress: Callable[[str, float], None] = progress_bar,
 ) -> Replay:
@@ -341,9 +333,8 @@ def replay(
         Faults put into the readings; their times count from the first sample.
     progress : callable
         ``progress(text, share)``, some hundred times.
-    watch : tuple, optional
-        A fault bank that looks for faults in place of the estimator's detector, the record as read,
-        and the smallest offsets that it sees.
+    watch : Watching, optional
+        A fault bank that looks for faults in place of the estimator's detector.
 
     Raises
     ------
@@ -372,9 +363,7 @@ def replay(
     used, failed = readings.copy(), np.zeros(readings.shape, dtype=bool)
     judged = None
     if watch is not None:
-        from irj_fmu.estimator.bank import judgement
-
-        judged = judgement(watch[0], watch[1], even, joint, tried)
+        judged = judgement(watch, even, joint, tried)
         failed = judged.failed
         used = np.where(failed, judged.readings, used)
         valid = (np.array(valid) & ~failed).tolist()
@@ -393,8 +382,12 @@ def replay(
         progress(f"tracking {record.name}", part.stop / len(even))
     course, looks, verdicts = stepper.course, stepper.looks, stepper.verdicts
     events = stepper.events
+    scores = np.array([row for _, row in looks]).reshape(-1, len(READINGS))
     if judged is not None:
         events = [_bank_event(e) for e in judged.events]
+        verdicts = list(judged.verdicts)
+        begins = np.array([0, *(k + 1 for k, _ in looks[:-1])], dtype=np.int64)
+        scores = np.maximum.reduceat(judged.scores, begins)[: len(looks)] if looks else scores
     if not course and not events:
         longest = max(part.stop - part.start for part in even.segments()) * even.dt
         where = (
@@ -415,7 +408,7 @@ def replay(
         sigmas=sigmas,
         ratios=ratios,
         looks=np.array([k for k, _ in looks], dtype=np.int64),
-        scores=np.array([row for _, row in looks]).reshape(-1, len(READINGS)),
+        scores=scores,
         events=tuple(events),
         verdicts=tuple(verdicts),
         healthy=healthy,
@@ -426,7 +419,7 @@ def replay(
         calibrated=watch is not None
         or (estimator.detector is not None and detector_state is not None),
         banked=watch is not None,
-        smallest={} if watch is None else watch[2],
+        smallest={} if watch is None else watch.smallest,
     )
 
 

@@ -18,13 +18,16 @@ from identification.data.joint_file import Joint, parse_joint
 from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
+from irj_fmu.estimator.bank import Watching, bank_for, measured_sensors
 from irj_fmu.estimator.healthy import detector_state, online_readings
 from workbench.cli.following.growing import follow as growing
 from workbench.cli.following.source import source as followed_source
+from workbench.cli.online import limits_fit
 from workbench.cli.online import replay as followed
 from workbench.page.analysis import Progress, clean
 from workbench.page.desk.sources import stopped
 from workbench.page.jobs.place import Place
+from workbench.page.records import without_windows
 from workbench.page.session import StepEntry, write_atomic
 from workbench.show.replayed import READINGS, Replay, standing
 
@@ -136,9 +139,17 @@ def replay(
         )
     tried, note = _tried(part, joint, asked)
     progress("taking the limits from the records of the fit", 0.02)
-    state, why = _limits_here(live, steps, joint, options, part.resampled().dt)
+    watch = _watching(live, steps, joint, asked)
+    state, why = None, ""
+    if watch is None:
+        state, why = _limits_here(live, steps, joint, options, part.resampled().dt)
     made = followed(
-        part, joint, state, tried, progress=lambda text, share: progress(text, 0.05 + 0.9 * share)
+        part,
+        joint,
+        state,
+        tried,
+        watch,
+        progress=lambda text, share: progress(text, 0.05 + 0.9 * share),
     )
     asked_for = {"file": asked.file, "sensor": asked.sensor, "kind": asked.kind}
     return _kept(folder, made, steps, {"note": note, "no_detector": why, "asked": asked_for})
@@ -202,7 +213,7 @@ def _kept(folder: Path, made: Replay, steps: Sequence[StepEntry], more: Mapping[
             "effects": list(steps[-1].effects),
             "start": float(made.record.time[0]),
             "note": "",
-            "detector": estimator.detector is not None,
+            "detector": made.watched,
             "unit": "s",
             "readings": [r for r, there in zip(READINGS, estimator.present, strict=True) if there],
             **more,
@@ -212,6 +223,30 @@ def _kept(folder: Path, made: Replay, steps: Sequence[StepEntry], more: Mapping[
     path = folder / FILE
     write_atomic(path, json.dumps(found, allow_nan=False).encode())
     return path
+
+
+def _watching(
+    live: Place, steps: Sequence[StepEntry], joint: Joint, asked: Request
+) -> Watching | None:
+    """The fault bank that `irj track` would take, with the records of the fit as healthy ones, and
+    kept for the next replay of the same model; None where none can be made.
+    """
+    files = [f for f in live.state.files if f.status == "ready" and f.role == "train"]
+    record = _part(live.as_read(asked.file), asked)
+    healthy = [without_windows(live.as_read(f.id), f.left_out) for f in files]
+    mark = (
+        *(steps[-1].values, steps[-1].effects, [(f.id, f.left_out) for f in files]),
+        *(measured_sensors(record), round(record.dt, 9), bool((np.diff(record.time) >= 0).all())),
+    )
+    known = live.kept.get("bank")
+    if known is None or known[0] != mark:
+        try:
+            limits_fit(record, healthy)
+            made = bank_for(joint, record, healthy)
+        except InputError:  # the detector says what it needs
+            made = None
+        known = live.kept["bank"] = (mark, made)
+    return None if known[1] is None else Watching(known[1], record)
 
 
 def _limits_here(

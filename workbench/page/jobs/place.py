@@ -181,6 +181,23 @@ class Place:
                 raise InputError(made.message or f"{entry.name}: cannot be read")
         return self._records[identifier]
 
+    def as_read(self, identifier: str) -> Record:
+        """The record of an upload with its holes and stamps, before the gate's repairs.
+
+        Raises
+        ------
+        InputError
+            Unknown, or not readable.
+        """
+        entry = next((f for f in self.state.files if f.id == identifier), None)
+        if entry is None:
+            raise InputError("no such record in this session")
+        path, columns = self.session.path_of(entry), self.columns_of(entry)
+        made, record = opened(entry, path, self.kind_of(entry), columns)
+        if record is None:
+            raise InputError(made.message or f"{entry.name}: cannot be read")
+        return record
+
     def analysis(self) -> Analysis:
         """The analysis of the state as it is; prepared again after a restart."""
         with self.building:
