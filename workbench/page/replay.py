@@ -18,6 +18,7 @@ from identification.data.joint_file import Joint, parse_joint
 from identification.data.plain_text import from_toml
 from identification.data.record import Record
 from identification.errors import InputError
+from identification.faults.types import Verdict
 from irj_fmu.estimator.bank import Watching, bank_for, measured_sensors
 from irj_fmu.estimator.healthy import detector_state, online_readings
 from workbench.cli.following.growing import follow as growing
@@ -46,6 +47,8 @@ TRIED: Final = ("none", "stuck", "dropout", "bias", "gain", "noise", "drift", "s
 SHARE: Final = {"bias": 0.1, "noise": 0.1, "spike": 0.3, "drift": 0.02}
 """Size of a tried fault as a share of the reading's range (of a drift: per second)."""
 GAIN: Final = 0.2
+WHOLE: Final = {Verdict.PLANT: ["joint"], Verdict.DEAD: ["readings"]}
+"""What a verdict is about that names no sensor."""
 FILE: Final = "replay.json"
 REWRITTEN: Final = 0.5
 """Time between two writings of what a growing file gives [s]: half of that between two looks."""
@@ -354,6 +357,7 @@ def _result(made: Replay) -> dict[str, Any]:
             f"{made.estimator.options.warm_up:g} s; ask for a longer part"
         )
     estimator, whole = made.estimator, made.record.time
+    first = {float(e["time"]): float(e.get("first", e["time"])) for e in made.events}
     units = {p.name: p for p in estimator.model.parameters}
     at = np.searchsorted(whole[made.looks], made.time)
     theta, ratio = (
@@ -372,7 +376,12 @@ def _result(made: Replay) -> dict[str, Any]:
             for row in made.failed[made.looks].tolist()
         ],
         "verdicts": [
-            {"time": time - origin, "text": str(e.verdict), "about": list(e.sensors)}
+            {
+                "time": time - origin,
+                "first": first.get(time, time) - origin,
+                "text": str(e.verdict),
+                "about": list(e.sensors) or WHOLE.get(e.verdict, []),
+            }
             for time, e in made.verdicts
         ],
         "standing": standing([(t - origin, e) for t, e in made.verdicts], watched=made.watched),

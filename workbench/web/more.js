@@ -140,7 +140,7 @@ views.replay = async (state) => {
       kind === "none" ? null : choice("replay-sensor", "In the sensor", sensors.map((s) => [s, s]), draft.sensor || sensors[3], "", keep("sensor")),
       kind === "none" ? null : field("replay-at", "From then on [s]", draft.at ?? "", "empty: at 60 %")),
     button("Replay", go, { kind: "primary", id: "replay" }));
-  const head = heading("Online replay", "The estimator that the FMU carries, fed sample by sample: what it would have said while the joint ran. It starts from the fitted joint, follows its parameters, and doubts readings that disagree with the others.");
+  const head = heading("Online replay", "The estimator that the FMU carries, fed sample by sample: it starts from the fitted joint and follows its parameters. Sensors are judged as by irj track: about a second after the first sign. The FMU's own detector takes milliseconds and errs more often.");
   if (!last.time) return [head, live, form];
   const table = await get("/view/parameters").catch(() => ({}));
   const stale = last.effects.join() !== state.steps[state.steps.length - 1].effects.join();
@@ -150,7 +150,7 @@ views.replay = async (state) => {
   return [head, live, form, stale ? h("p", { class: "note" }, "This replay belongs to an earlier model; replay again.") : null,
     h("section", { class: "card", id: "timeline" }, h("h2", {}, "Fault timeline"), h("p", {}, h("strong", { id: "standing" }, sentence(verdict)), ` ${last.record}, ${seconds(last.end)}${last.live ? " so far" : ""}.`), last.note ? h("p", { class: "note small" }, last.note) : null, last.no_detector ? h("p", { class: "note small" }, `${last.no_detector.charAt(0).toUpperCase()}${last.no_detector.slice(1)}.`) : null,
       kept("Fault timeline", timeline(last), () => timelineCsv(last)), h("p", { class: "small soft" }, "Shade: largest residual that holds the reading, as a share of its limit (full height: at the limit). Bar: declared failed and replaced by the estimate."),
-      last.verdicts.length > 1 || marks.length ? h("details", { open: last.verdicts.length < 5 }, h("summary", {}, `What it said (${last.verdicts.length})`), h("ul", { class: "findings" }, last.verdicts.map((v) => h("li", {}, h("strong", {}, seconds(v.time)), " ", v.about.length ? `${words(v.about.join(", "))}: ` : "", v.text)))) : null),
+      last.verdicts.length > 1 || marks.length ? h("details", { open: last.verdicts.length < 5 }, h("summary", {}, `What it said (${last.verdicts.length})`), h("ul", { class: "findings" }, last.verdicts.map((v) => h("li", {}, h("strong", {}, seconds(v.time)), " ", v.about.length ? `${words(v.about.join(", "))}: ` : "", v.text, v.time - v.first > 1e-3 ? ` First sign at ${seconds(v.first)}.` : "")))) : null),
     h("section", { class: "card" }, h("h2", {}, "Residual over floor"), h("p", { class: "soft small" }, "1 × means that only noise is left. It is the mean over the last two seconds."), host),
     h("section", { class: "card" }, h("h2", {}, "Parameters as they were followed"), h("p", { class: "soft small" }, "Line: the online estimate; dashed: the value of the fit."), h("div", { class: "sparks" }, Object.entries(last.parameters).map(([n, p]) => followed(n, p, last.time, last.end, (table[n] || {}).stderr))))];
 };
