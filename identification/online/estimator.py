@@ -50,7 +50,7 @@ from identification.online.verdict import (
     plant_alarm,
     worst,
 )
-from identification.online.watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Watch
+from identification.online.watch import DRIVE, Q_L, Q_M, SAMPLED, TAU, W_L, W_M, Twist, Watch
 from identification.recursive.estimator import RecursiveLeastSquares, Settings
 from identification.recursive.prior_start import PriorStart
 from identification.two_step.algorithm import OnlineSettings
@@ -140,7 +140,7 @@ class OnlineEstimator:
             self.needs[reading] = used[k] and self.present[reading]
         self.calibration = Calibration(self.model, self.names, dt)
         self.samples = Samples(self.rows.timing, self.needs, self._alignment())
-        self.watch = Watch(dt, self.present)
+        self.watch = Watch(dt, self.present, Twist.of(self.model))
         self.grid = Grid(dt, max(GAP * self.rows.timing.length, 1.5 * dt))
         self.pulse = Pulse(dt, self.rows.timing.length, self.present)
         own = {p.name: (p.low, p.high) for p in self.model.parameters}

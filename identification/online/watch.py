@@ -1,15 +1,19 @@
-"""Checks of the readings that need no model: noise, sensors that stand still, sensors of the
+"""Checks of the readings that need no filter: noise, sensors that stand still, sensors of the
 wrong scale.
 """
 
 from __future__ import annotations
 
-from typing import Final, final
+from typing import TYPE_CHECKING, Final, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
 
+from identification.balance.clocks import MOST_SKEW
 from identification.balance.noise import noise_level
+
+if TYPE_CHECKING:
+    from casadi_models import JointModel
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,9 +27,52 @@ SAMPLED: Final = (Q_M, Q_L, TAU, DRIVE)
 _MOVED: Final = 1e-3
 _SCALE_MOTION: Final = 2e-2
 SCALE: Final = 0.2
+SOFTER: Final = 2.0
+"""Factor by which a healthy gear may be softer than the file says before the rest of its twist
+counts as play."""
+FARTHEST: Final = 0.1
+"""Twist up to which a transmission is looked at for its play [rad]: 6 degrees; m on a linear
+axis."""
 MEMORY: Final = 30
 TINY: Final = 1e-300
 """What keeps a division from zero; nothing measured is as small."""
+
+
+class Twist(NamedTuple):
+    """How far the two positions of a healthy joint may lie apart: play and a share of the torque.
+
+    Attributes
+    ----------
+    play : float
+        [rad]
+    compliance : float
+        [rad/N.m]
+    """
+
+    play: float = 0.0
+    compliance: float = 0.0
+
+    @classmethod
+    def of(cls, model: JointModel) -> Twist:
+        """Of a joint at its values; none where the link is not apart.
+
+        The play is what the twist is larger than by the stiffness: that of a gap, or of a spring
+        that begins soft.
+        """
+        name = model.stiffness_name
+        values = dict(zip(model.parameter_names, model.value_vector(), strict=True))
+        if not model.is_elastic or name is None or not values[name] > 0.0:
+            return cls()
+        from casadi_models.functions import JointFunctions
+
+        own = JointFunctions(model)
+        twist = np.linspace(0.0, FARTHEST, 201)
+        x = np.zeros((len(own.state_names) + len(own.memory_names), len(twist)))
+        x[0] = twist
+        torque = np.array(own.outputs(x, np.zeros(own.outputs.size1_in(1)), list(values.values())))
+        carried = torque[-1] - torque[-1, 0]
+        compliance = SOFTER / values[name]
+        return cls(max(float(np.max(twist - compliance * carried)), 0.0), compliance)
 
 
 @final
@@ -38,8 +85,8 @@ class Watch:
         Sample time [s].
     present : tuple of bool
         Which of :data:`READINGS` the joint has.
-    rotary : bool
-        False: positions are in m.
+    twist : Twist
+        What the positions of a healthy joint differ by beside their clocks.
 
     Attributes
     ----------
@@ -50,8 +97,8 @@ class Watch:
         factor.
     """
 
-    def __init__(self, dt: float, present: tuple[bool, ...]) -> None:
-        self.dt, self.present = dt, present
+    def __init__(self, dt: float, present: tuple[bool, ...], twist: Twist = Twist()) -> None:  # noqa: B008 - frozen
+        self.dt, self.present, self.twist = dt, present, twist
         self.length = int(np.clip(round(1.0 / dt), 64, 1024))
         self.reset()
 
@@ -113,13 +160,22 @@ class Watch:
                 own[position] = _slope(np.cumsum(travelled), np.cumsum(change))
                 self.scaled[velocity] = abs(own[position] - 1.0) > SCALE
         if good[Q_M] and good[Q_L] and max(spread[Q_M], spread[Q_L]) > _SCALE_MOTION:
-            wrong = abs(_slope(self.rows[:, Q_L], self.rows[:, Q_M]) - 1.0) > SCALE
+            apart = abs(_slope(self.rows[:, Q_L], self.rows[:, Q_M]) - 1.0) - SCALE
+            wrong = apart * float(spread[Q_M]) > self._apart(good, spread)
             off_m, off_l = (abs(own.get(i, 1.0) - 1.0) > SCALE for i in (Q_M, Q_L))
             self.scaled[Q_L] = wrong and off_l and not off_m
             self.scaled[Q_M] = wrong and not self.scaled[Q_L]
             if wrong:
                 self.scaled[W_M] = self.scaled[W_M] and not self.scaled[Q_M]
                 self.scaled[W_L] = self.scaled[W_L] and not self.scaled[Q_L]
+
+    def _apart(self, good: list[bool], spread: FloatArray) -> float:
+        """Largest change of the twist of a healthy joint in the last second, as it is read: by its
+        play, by the torque, and by a clock that is late.
+        """
+        torque = float(spread[TAU if good[TAU] else DRIVE])
+        step = float(np.max(np.abs(np.diff(self.rows[:, Q_M]))))
+        return 2.0 * self.twist.play + self.twist.compliance * torque + MOST_SKEW * step
 
     def numbers(self) -> FloatArray:
         """Everything that changes, as one array."""

@@ -1,4 +1,4 @@
-/* Checks of the readings that need no model, as identification.online.watch.Watch makes them. */
+/* Checks of the readings that need no filter, as identification.online.watch.Watch makes them. */
 
 /* The k-th smallest of n values goes to its place, smaller ones before it. */
 static double select_value(double v[], int n, int k) {
@@ -49,6 +49,14 @@ static double slope_of(const double x[], const double y[], int n) {
     return xy / fmax(yy, TINY);
 }
 
+/* Largest change of the twist of a healthy joint in the last second, as it is read. */
+static double apart_of(const Watch *w, const int good[SENSORS], const double spread[SENSORS]) {
+    double step = 0;
+    int i;
+    for (i = 0; i < WATCH - 1; i++) step = fmax(step, fabs(w->rows[i + 1][Q_M] - w->rows[i][Q_M]));
+    return 2 * TWIST_PLAY + TWIST_COMPLIANCE * spread[good[TAU] ? TAU : DRIVE] + MOST_SKEW * step;
+}
+
 /* Ratio of velocity reading to position reading, and of the two positions. */
 static void check_scales(Twin *m, const int good[SENSORS], const double spread[SENSORS]) {
     Watch *w = &m->s.watch;
@@ -69,7 +77,7 @@ static void check_scales(Twin *m, const int good[SENSORS], const double spread[S
     if (good[Q_M] && good[Q_L] && fmax(spread[Q_M], spread[Q_L]) > SCALE_MOTION) {
         int wrong, off_m = fabs(own[0] - 1) > SCALE_ERROR, off_l = fabs(own[1] - 1) > SCALE_ERROR;
         for (i = 0; i < WATCH; i++) { travelled[i] = w->rows[i][Q_L]; change[i] = w->rows[i][Q_M]; }
-        wrong = fabs(slope_of(travelled, change, WATCH) - 1) > SCALE_ERROR;
+        wrong = (fabs(slope_of(travelled, change, WATCH) - 1) - SCALE_ERROR) * spread[Q_M] > apart_of(w, good, spread);
         w->scaled[Q_L] = wrong && off_l && !off_m;
         w->scaled[Q_M] = wrong && !w->scaled[Q_L];
         if (wrong) {

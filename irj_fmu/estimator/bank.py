@@ -89,7 +89,10 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
                 "records with the same channels"
             )
         table = np.array(online_readings(other, joint)[0])
-        pieces += [Piece(other.time[part], table[part]) for part in other.segments()]
+        every = max(1, round(record.dt / other.dt))  # windows of the statistics count samples
+        pieces += [
+            Piece(other.time[part][::every], table[part][::every]) for part in other.segments()
+        ]
     bank = FaultBank(
         model, record.dt, there, doubts=doubts_of(joint, model), late=lateness(joint, healthy)
     )

@@ -18,7 +18,7 @@ from typing import Any, Final, final
 import numpy as np
 import numpy.typing as npt
 
-from identification.balance.clocks import SURE, cubic
+from identification.balance.clocks import MOST_SKEW, SURE, cubic
 from identification.balance.noise import CUT_DEVIATION, FOURTH_GAIN, KEPT
 from identification.data.joint_file import Joint
 from identification.errors import InputError
@@ -331,6 +331,9 @@ def _watch_tables(header: _Header, made: OnlineEstimator) -> None:
     for name in ("MOVED", "SCALE_MOTION"):
         header.define(name, float(getattr(watch_settings, f"_{name}")))
     header.define("SCALE_ERROR", float(watch_settings.SCALE))
+    header.define("TWIST_PLAY", float(made.watch.twist.play))
+    header.define("TWIST_COMPLIANCE", float(made.watch.twist.compliance))
+    header.define("MOST_SKEW", float(MOST_SKEW))
     header.define("NOISE_MEMORY", watch_settings.MEMORY)
     header.define("NOISE_KEPT", KEPT)
     header.define("NOISE_GAIN", FOURTH_GAIN)

@@ -1,15 +1,23 @@
-"""`irj track` where no velocity is measured: the fault bank looks at the sensors that there are."""
+"""`irj track` with healthy records: the fault bank looks at the sensors that there are."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.faults.plant import plant
+from identification.data.joint_file import load_joint
+from identification.data.read import read
+from identification.faults.bank import FaultBank
+from identification.faults.bank_levels import Piece
+from identification.faults.core import SENSORS
 from identification.faults.types import Verdict
+from irj_fmu.estimator.bank import bank_for
 from workbench.cli.main import main
 from workbench.cli.online import _bank_event
 
@@ -101,6 +109,29 @@ def test_without_healthy_records_no_derived_velocity_is_judged(
     assert not result["detector"]
     assert "--healthy" in result["not_watched"]
     assert result["not_watched"] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_limits_are_of_the_rate_and_the_readings_of_the_record(
+    folder: Path, velocities: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A healthy record that is finer is thinned; a velocity that it lacks is not judged."""
+    taken: list[Sequence[Piece]] = []
+    monkeypatch.setattr(FaultBank, "calibrate", lambda _self, pieces: taken.append(pieces))
+    joint = load_joint(folder / "joint.toml")
+    healthy = read(folder / "healthy.npz")
+    coarse = healthy.take(slice(None, None, 3))
+    coarse = replace(coarse, segment=np.zeros(len(coarse), dtype=np.int64))
+    named = ("motor_velocity", "link_velocity") if velocities else ()
+    speeds = {n: np.gradient(coarse[n.replace("velocity", "position")], coarse.time) for n in named}
+    record = replace(coarse, channels={**coarse.channels, **speeds})
+    bank = bank_for(joint, record, [healthy])
+    assert bank is not None
+    assert [SENSORS[i] for i in bank.sensors] == [
+        *("current", "motor_position", "link_position", "torque")
+    ]
+    steps = np.concatenate([np.diff(p.time) for p in taken[0]])
+    assert np.median(steps) == pytest.approx(coarse.dt)
 
 
 @pytest.mark.parametrize(
