@@ -353,6 +353,9 @@ def write_page(results: Results, path: Path) -> None:
     trajectories = len(results["sizes"]) // (len(FACTORS) * sum(map(len, SIZES.values())))
     page = f"""# Sensor faults: what is found, how soon, from which size on
 
+This is the detector of the estimator FMUs and of `irj track --follow`, which takes milliseconds. Recordings are judged by the bank
+of [fault_bank.md](fault_bank.md), which takes a second and errs less often on joints of another make.
+
 Every figure on this page is printed by
 
     {COMMAND}
