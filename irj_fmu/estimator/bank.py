@@ -65,6 +65,7 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
         A healthy record lacks a reading that the record has.
     """
     from identification.faults.bank import FaultBank
+    from identification.faults.bank_kept import calibrated
     from identification.faults.bank_levels import Piece
 
     options = OnlineOptions(
@@ -96,7 +97,7 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
     bank = FaultBank(
         model, record.dt, there, doubts=doubts_of(joint, model), late=lateness(joint, healthy)
     )
-    bank.calibrate(pieces)
+    calibrated(bank, pieces)
     return bank
 
 
@@ -160,11 +161,12 @@ def smallest_offsets(
     """Smallest offset of each sensor that a bank sees, and that it names, on the longest stretch of
     a healthy record (see :meth:`identification.faults.bank.FaultBank.smallest`).
     """
+    from identification.faults.bank_kept import smallest
     from identification.faults.bank_levels import Piece
 
     longest = max(healthy.segments(), key=lambda s: s.stop - s.start)
     rows = np.array(online_readings(healthy, joint)[0])[longest]
-    return bank.smallest(Piece(healthy.time[longest], rows))
+    return smallest(bank, Piece(healthy.time[longest], rows))
 
 
 def judged(

@@ -21,6 +21,7 @@ import pytest
 from casadi_models import EFFECTS, JointModel
 from identification import load_joint, read
 from identification.data.typical import true_values
+from identification.faults.bank import WAITS
 from tests.workbench.test_outputs import given
 from workbench.cli import files as outputs
 from workbench.cli import loop
@@ -571,7 +572,8 @@ def test_track_finds_a_link_sensor_that_fails(
     assert main([*command, "--json", str(tmp_path / "t.json"), "--fail-on-fault"]) == 1
     capsys.readouterr()
     events = data(tmp_path, "t.json")["records"][0]["events"]
-    assert 9.0 <= events[0]["time"] <= 9.2
+    assert 9.0 <= events[0]["first"] <= 9.2
+    assert events[0]["time"] <= events[0]["first"] + WAITS[-1]
     assert events[0]["text"].startswith("link position")
 
 

@@ -13,7 +13,6 @@ import pytest
 from benchmarks.faults.plant import plant
 from identification.data.joint_file import load_joint
 from identification.data.read import read
-from identification.faults.bank import FaultBank
 from identification.faults.bank_levels import Piece
 from identification.faults.core import SENSORS
 from identification.faults.types import Verdict
@@ -117,7 +116,8 @@ def test_limits_are_of_the_rate_and_the_readings_of_the_record(
 ) -> None:
     """A healthy record that is finer is thinned; a velocity that it lacks is not judged."""
     taken: list[Sequence[Piece]] = []
-    monkeypatch.setattr(FaultBank, "calibrate", lambda _self, pieces: taken.append(pieces))
+    kept = "identification.faults.bank_kept.calibrated"
+    monkeypatch.setattr(kept, lambda _bank, pieces: taken.append(pieces))
     joint = load_joint(folder / "joint.toml")
     healthy = read(folder / "healthy.npz")
     coarse = healthy.take(slice(None, None, 3))
