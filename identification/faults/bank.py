@@ -100,8 +100,9 @@ class BankTrack:
     scores : (n, filters) array
         Largest statistic of each filter over its limit; the first one reads all sensors.
     residuals : (n, 6) array
-        Largest statistic of each reading in that first filter over its limit (see
-        :func:`identification.faults.bank_statistics.by_reading`); 0 where no filter ran.
+        Largest statistic of each reading over its limit (see
+        :func:`identification.faults.bank_statistics.by_reading`) in that first filter; while a
+        sensor counts as failed, in the one without it. 0 where no filter ran.
     """
 
     events: tuple[FaultEvent, ...]
@@ -553,8 +554,12 @@ class _Work:
                     break
         return found
 
-    def _scored(self, states: Sequence[FilterState], part: slice, skip: int = 0) -> FloatArray:
-        """Scores of all filters over a stretch; the first so many samples only fill the windows."""
+    def _scored(
+        self, states: Sequence[FilterState], part: slice, skip: int = 0, shown: int = 0
+    ) -> FloatArray:
+        """Scores of all filters over a stretch, whose first so many samples only fill the windows;
+        the residuals of one of them are those of the readings.
+        """
         bank, tuning = self.bank, self.tuning
         time, rows = self.time[part], self.rows[part]
         course = bank.joint.run(states, time, rows, bank.flags(len(time)), levels=tuning.levels)
@@ -562,7 +567,7 @@ class _Work:
         for k in range(len(states)):
             shares = statistics(course, k, bank.joint, tuning.levels) / tuning.limits[k]
             out[:, k] = np.nan_to_num(shares.max(axis=1), nan=np.inf)
-            if k == 0:
+            if k == shown:
                 own = np.nan_to_num(by_reading(shares), nan=np.inf)
                 self.residuals[part.start + skip : part.stop] = own[skip:]
         self.scores[part.start + skip : part.stop] = out[skip:]
@@ -639,7 +644,7 @@ class _Work:
         while at < last:
             end = min(int(np.searchsorted(self.time, self.time[at] + RECOVER)), last)
             part = slice(at, max(end, at + 1))
-            scores = self._scored([state] * (1 + len(bank.sensors)), part)
+            scores = self._scored([state] * (1 + len(bank.sensors)), part, shown=without)
             there = np.isfinite(self.rows[part, sensor]).all()
             if there and scores[:, 0].max() < 1 and end < last:
                 self.failed[begin:end, sensor] = True

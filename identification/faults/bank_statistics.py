@@ -73,7 +73,7 @@ def by_reading(shares: FloatArray, readings: int = 5) -> FloatArray:
     Parameters
     ----------
     shares : (n, count) array
-        Of :func:`statistics`, of the filter that reads all sensors.
+        Of :func:`statistics`, of one filter.
     readings : int
 
     Returns
