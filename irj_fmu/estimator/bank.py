@@ -97,7 +97,10 @@ def bank_for(joint: Joint, record: Record, healthy: Sequence[Record]) -> FaultBa
     bank = FaultBank(
         model, record.dt, there, doubts=doubts_of(joint, model), late=lateness(joint, healthy)
     )
-    calibrated(bank, pieces)
+    try:
+        calibrated(bank, pieces)
+    except InputError as error:
+        raise InputError(f"{', '.join(r.name for r in healthy)}: {error}") from None
     return bank
 
 

@@ -97,6 +97,33 @@ def test_lost_samples_are_no_fault_and_a_fault_is_named_among_them(
     assert 9.99 <= events[0]["first"] < 10.1
 
 
+def test_pieces_too_short_for_the_estimator_are_judged_all_the_same(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with np.load(folder / "unseen.npz") as whole:
+        t = whole["time_s"] - whole["time_s"][0]
+        kept = (t < 5.0) | ((t > 6.0) & (t < 11.0))
+        np.savez(tmp_path / "pieces.npz", **{n: whole[n][kept] for n in whole.files})
+    given = ["track", str(tmp_path / "pieces.npz"), "--joint", str(folder / "joint.toml")]
+    given += ["--healthy", str(folder / "healthy.npz")]
+    assert main(given) == 0
+    said = capsys.readouterr().out
+    assert "the parameters were not estimated" in said
+    assert "no sensor fault" in said
+    assert main([*given, "--inject", "link_position:bias:8:0.01"]) == 0
+    assert "link position: sensor failed" in capsys.readouterr().out
+
+
+def test_a_healthy_record_that_is_too_short_is_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with np.load(folder / "healthy.npz") as whole:
+        np.savez(tmp_path / "short.npz", **{n: whole[n][:500] for n in whole.files})
+    given = ["track", str(folder / "unseen.npz"), "--joint", str(folder / "joint.toml")]
+    assert main([*given, "--healthy", str(tmp_path / "short.npz")]) == 2
+    assert "short.npz: fault bank: give healthy records longer than 3 s" in capsys.readouterr().err
+
+
 def test_without_healthy_records_no_derived_velocity_is_judged(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

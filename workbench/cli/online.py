@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from identification.data.formats import words
 from identification.errors import InputError
+from identification.faults.bank_levels import SETTLE
 from irj_fmu.command_line import counted
 from irj_fmu.estimator.bank import Watching, bank_for, judgement, measured_sensors, smallest_offsets
 from irj_fmu.estimator.healthy import may_watch, online_readings
@@ -388,8 +389,8 @@ def replay(
         verdicts = list(judged.verdicts)
         begins = np.array([0, *(k + 1 for k, _ in looks[:-1])], dtype=np.int64)
         scores = np.maximum.reduceat(judged.scores, begins)[: len(looks)] if looks else scores
-    if not course and not events:
-        longest = max(part.stop - part.start for part in even.segments()) * even.dt
+    longest = max(part.stop - part.start for part in even.segments()) * even.dt
+    if not course and not events and (judged is None or longest < 2 * SETTLE):
         where = (
             "are too short"
             if len(even.segments()) == 1
