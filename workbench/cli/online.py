@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
+LIMITS: Final = "limits from the healthy records"
+"""What is worked on for half a minute the first time."""
 POINTS: Final = 400
 """Points of the parameters' course kept per record."""
 
@@ -159,7 +161,11 @@ def _banks(
         one_run = bool((np.diff(record.time) >= 0).all())
         key = (one_run, *measured_sensors(record), float(f"{record.dt:.3g}"))
         if key not in made:
+            if healthy:
+                progress_bar(LIMITS, 0.0)
             made[key] = bank_for(joint, record, healthy)
+            if healthy:
+                progress_bar(LIMITS, 1.0)
         out.append(made[key])
     return out
 
