@@ -5,23 +5,24 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from identification.faults import bank_clocks, bank_levels, bank_spring, bank_statistics
-from identification.online import filter as filters
-from identification.online import filter_step
+from identification import faults, online
+from identification.balance import noise
+from identification.fitting import window_run
 from identification.recursive.compiler import kept
 
 if TYPE_CHECKING:
     from identification.faults.bank import FaultBank, Tuning
     from identification.faults.bank_levels import Piece
 
-_MODULES = (bank_clocks, bank_levels, bank_spring, bank_statistics, filters, filter_step)
+_PACKAGES, _MODULES = (faults, online), (noise, window_run)
+"""Code that levels and limits follow from; the equations go by what they are made into."""
 
 
 def calibrated(bank: FaultBank, healthy: Sequence[Piece]) -> Tuning:
@@ -50,7 +51,10 @@ def smallest(bank: FaultBank, healthy: Piece) -> dict[str, tuple[float, float]]:
     """
     tuning = bank.tuned
     own = [*identity(bank), repr(tuning.levels).encode(), tuning.limits.tobytes()]
-    make: Callable[[], bytes] = lambda: json.dumps(bank.smallest(healthy)).encode()  # noqa: E731
+
+    def make() -> bytes:
+        return json.dumps(bank.smallest(healthy)).encode()
+
     found = json.loads(kept("offsets", [*own, *_numbers([healthy])], make))
     return {name: (seen, told) for name, (seen, told) in found.items()}
 
@@ -59,11 +63,11 @@ def identity(bank: FaultBank) -> list[bytes]:
     """All that the levels and limits of a bank follow from beside the healthy readings: its
     equations and values, its sensors, and the code that works with them.
     """
-    from identification.faults import bank as own
-
     told: list[Any] = [bank.dt, bank.measured, bank.late, bank.joint.size]
     out = [metadata.version(n).encode() for n in ("numpy", "casadi")]
-    out += [Path(m.__file__).read_bytes() for m in (own, *_MODULES) if m.__file__]
+    files = [Path(m.__file__) for m in _MODULES if m.__file__]
+    files += [f for p in _PACKAGES for f in sorted(Path(p.__path__[0]).glob("*.py"))]
+    out += [f.read_bytes() for f in files]
     for one in (bank.joint, bank.known):
         out += [one.predict.serialize().encode(), one.update.serialize().encode()]
         told += [list(one.values.items()), one.logarithmic, one.substeps]

@@ -101,19 +101,20 @@ def doubled(a: FloatArray, c: FloatArray, q: FloatArray, r: FloatArray) -> Float
     readings = c * units / np.sqrt(r)[:, None]
     seen, found, unit = readings.T @ readings, np.eye(size), np.eye(size)
     best: tuple[float, FloatArray] = (math.inf, np.diag(q))
-    for _ in range(DOUBLINGS):
-        reduced = np.linalg.solve(unit + seen @ found, np.hstack([forward, seen]))
-        change = forward.T @ found @ reduced[:, :size]
-        seen = seen + forward @ reduced[:, size:] @ forward.T
-        forward = forward @ reduced[:, :size]
-        found = found + change
-        seen, found = (seen + seen.T) / 2, (found + found.T) / 2
-        if not (np.isfinite(found).all() and (np.diag(found) > 0).all()):
-            break
-        tried = np.asarray(found * np.outer(units, units), dtype=np.float64)
-        best = min(best, (_off(tried, a, c, q, r), tried), key=lambda one: one[0])
-        if np.max(np.abs(change) / _sizes(found)) < SETTLED:
-            break
+    with contextlib.suppress(np.linalg.LinAlgError):
+        for _ in range(DOUBLINGS):
+            reduced = np.linalg.solve(unit + seen @ found, np.hstack([forward, seen]))
+            change = forward.T @ found @ reduced[:, :size]
+            seen = seen + forward @ reduced[:, size:] @ forward.T
+            forward = forward @ reduced[:, :size]
+            found = found + change
+            seen, found = (seen + seen.T) / 2, (found + found.T) / 2
+            if not (np.isfinite(found).all() and (np.diag(found) > 0).all()):
+                break
+            tried = np.asarray(found * np.outer(units, units), dtype=np.float64)
+            best = min(best, (_off(tried, a, c, q, r), tried), key=lambda one: one[0])
+            if np.max(np.abs(change) / _sizes(found)) < SETTLED:
+                break
     return best[1]
 
 
